@@ -1,4 +1,4 @@
-"""Alignment with barrel cortex: representational similarity to recorded animals. Needs no torch.
+"""Alignment of models with barrel cortex: representational similarity to recorded animals.
 
 rdm           RDMs of the six stimuli and their comparison
 reliability   split halves, Spearman-Brown, the correction for noise
@@ -6,10 +6,10 @@ neural, nwb, nwb_parts, selection   recordings: from NWB files, and in the publi
 strict, paper_code, building   the two protocols: recordings -> a frozen benchmark
 benchmark, json_file     the frozen benchmark and its file
 scoring, statistics      a model's layers -> score, exact p-value
-stimuli_input, layers, activations, onnx_activations, loading   a model -> its layers
+stimuli_input, layers, activations (torch), onnx_activations, loading   a model -> its layers
 example, example_files   a made-up brain with known truth, and its files
 metrics/, datasets/      plug-ins: measures of similarity; recordings with license and citation
-board, board_page        models by datasets by metrics
+board, board_page        table of models by datasets and metrics, and its page
 fidelity, gate, decoding, results, pictures, report   release tests, stored scores, the report
 """
 

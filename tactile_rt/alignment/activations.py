@@ -1,4 +1,4 @@
-"""Activations of every layer of a torch network, for the six stimuli.
+"""Activations of every layer of a torch network in response to the six stimuli.
 
 Layers are as in the paper: a node of the encoder's graph after its ReLU, a residual block's sum, a
 transformer block's output at the action token, a linear layer after its ReLU. Networks run in
@@ -36,7 +36,7 @@ Change = Callable[[Tensor], Tensor]
 
 
 def checkpoint_layers(path: Path, stimuli: StimuliInput) -> tuple[Layers, dict[str, Any]]:
-    """Return the layers of a checkpoint such as `best.pt`, and its other contents."""
+    """Run a checkpoint on the stimuli; return its layers and the checkpoint's contents."""
     model, saved = load_checkpoint(path)
     spec, timing = ArraySpec.from_json(saved["spec"]), model.timing
     stimuli.check(spec, timing.steps, timing.substeps, str(path), saved["period_ns"])
@@ -47,7 +47,7 @@ def checkpoint_layers(path: Path, stimuli: StimuliInput) -> tuple[Layers, dict[s
 
 
 def untrained_layers(saved: dict[str, Any], stimuli: StimuliInput, seed: int = 0) -> Layers:
-    """Return the layers of a checkpoint's network with random weights, as a control."""
+    """Run a checkpoint's network with random weights on the stimuli; return its layers."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         model = _draw_first_weights(build_untrained(saved), saved.get("config"))
@@ -55,10 +55,10 @@ def untrained_layers(saved: dict[str, Any], stimuli: StimuliInput, seed: int = 0
 
 
 def untrained_card_layers(card: ModelCard, stimuli: StimuliInput, seed: int = 0) -> Layers | None:
-    """Return the layers of the network that a model card describes, with random weights.
+    """Run a model card's network with random weights on the stimuli; return its layers.
 
-    None if the network cannot be built from the card, which may be of another program or of a later
-    release.
+    The result is None if the network cannot be built from the card, which may be from another
+    program or a later release.
     """
     network = card.provenance.get("network")
     if not isinstance(network, dict):
@@ -84,11 +84,7 @@ def untrained_card_layers(card: ModelCard, stimuli: StimuliInput, seed: int = 0)
 def network_layers(
     model: TactileClassifier, stimuli: StimuliInput, name: str = "network", sha256: str = ""
 ) -> Layers:
-    """Run a network on the six stimuli and return its layers; its mode is restored.
-
-    Raises:
-        ConfigError: the network needs other input than the frames of one array.
-    """
+    """Run a network on the six stimuli in evaluation mode; return its layers."""
     mode = model.training
     model.eval()
     try:
@@ -120,7 +116,7 @@ def network_layers(
 
 
 def _draw_first_weights(model: TactileClassifier, training: object) -> TactileClassifier:
-    """Draw initial weights as the paper's code does, if the training did; return the model."""
+    """Draw a model's initial weights as its training configuration specifies; return the model."""
     paper = table(training).get("first_weights") == "paper"
     if paper and isinstance(model.network.encoder, GraphEncoder):
         draw_as_published(model.network.encoder)
@@ -128,7 +124,7 @@ def _draw_first_weights(model: TactileClassifier, training: object) -> TactileCl
 
 
 def reach(graph: Graph) -> dict[str, int]:
-    """Compute each node's first step that depends on the frame, by the shortest path."""
+    """Return the first step, by node, at which the frame affects the node's output."""
     distance = {graph.frame.name: -1}
     nodes = graph.nodes
     for _ in graph.nodes:
@@ -141,7 +137,7 @@ def reach(graph: Graph) -> dict[str, int]:
 
 
 def _trace_encoder(encoder: Any, frames: Tensor) -> tuple[Traces, Tensor, dict[str, int]]:
-    """Return an encoder's traces, features (6, step, feature), and first steps by layer."""
+    """Run an encoder; return traces, features (6, step, feature), and first steps by layer."""
     if isinstance(encoder, GraphEncoder):
         traces, features = _trace_graph(encoder, frames)
         return traces, features, {f"encoder.{k}": v for k, v in reach(encoder.graph).items()}
@@ -161,7 +157,7 @@ def _trace_encoder(encoder: Any, frames: Tensor) -> tuple[Traces, Tensor, dict[s
 
 def _trace_graph(encoder: GraphEncoder, frames: Tensor) -> tuple[Traces, Tensor]:
     """Run a graph encoder step by step; return all nodes' outputs and the features."""
-    # Not in the window form, which leaves out nodes that reach no feature.
+    # Not by `forward`, which skips outputs that reach no feature of the window.
     found: dict[str, list[Tensor]] = {node.name: [] for node in encoder.graph.nodes}
     original = encoder._run_cell
 
@@ -213,7 +209,7 @@ def _tap_attender(attender: nn.Module) -> list[Tap]:
 
 
 def _tap_mamba(stack: MambaStack) -> list[Tap]:
-    """Tap the residual sum after each block: the input of the next norm."""
+    """List taps of the residual sum after each block, the next norm's input."""
     after = [*list(stack.norms)[1:], stack.norm]
     taps: list[Tap] = [(f"block{i}", norm, True, None) for i, norm in enumerate(after)]
     return [*taps, ("norm", stack.norm, False, None)]
@@ -237,7 +233,7 @@ def _tap_decoder(decoder: nn.Module) -> list[Tap]:
 
 @contextmanager
 def _record_taps(taps: list[Tap], part: str, frames: Tensor) -> Iterator[Traces]:
-    """Record the taps' tensors (6, step, unit) within a ``with`` block, in order."""
+    """Record the tapped tensors (6, step, unit) of forward passes within a ``with`` block."""
     shape = frames.shape[:2]
     traces: Traces = {f"{part}.{name}": frames for name, *_ in taps}  # placeholders, in order
 

@@ -1,8 +1,8 @@
 """A frozen benchmark: the data that scoring a model needs, without any animal's raw recordings.
 
 A deterministic model's score against an animal is r_xy times a factor that depends on the animal
-alone, so an RDM (15 numbers for six stimuli) and that factor per animal are enough. Its file is
-JSON with a hash of the content: a file of another version, or changed by hand, is refused.
+alone, so an RDM (15 numbers for six stimuli) and that factor per animal are enough. The file is
+JSON with a hash of the content: a file of another version, or changed by hand, is rejected.
 """
 
 import hashlib
@@ -24,7 +24,7 @@ FEWEST, MOST = 3, 50  # stimuli
 
 
 class Frozen(msgspec.Struct, frozen=True, eq=False, forbid_unknown_fields=True):
-    """An RDM with its reliability and noise correction.
+    """The RDM of a target, with its reliability and noise correction.
 
     Attributes:
         rdm: (pair,) The dissimilarities of the pairs of stimuli: for paper-code, from the mean
@@ -46,6 +46,8 @@ class Target(msgspec.Struct, frozen=True, eq=False, forbid_unknown_fields=True):
 
     Attributes:
         chosen: The RDM that the protocol scores on; for strict, from reliable units only.
+        unfiltered: The RDM of all units, reported as well.
+        reliable: True if the target counts in mean scores.
         trials: The number of trials used; for paper-code, the rows of the padded array.
     """
 
@@ -58,15 +60,14 @@ class Target(msgspec.Struct, frozen=True, eq=False, forbid_unknown_fields=True):
 
 
 class Consistency(msgspec.Struct, frozen=True, eq=False, forbid_unknown_fields=True):
-    """Scores of animals as predictors of each other.
+    """Consistency between animals: scores of animals as models of each other.
 
     Attributes:
         pooled: (animal,) The score of all other animals' units pooled against each animal; NaN
             without a score.
         pairwise: (animal, animal) The score between each row's and column's animal; NaN on the
             diagonal.
-        ddof: The degrees of freedom that the standard error deducts for the mean: 1, or 0 as in the
-            published analysis.
+        ddof: The degrees of freedom deducted in the standard error: 1, or 0 as published.
     """
 
     animals: tuple[str, ...]
@@ -81,7 +82,7 @@ class Consistency(msgspec.Struct, frozen=True, eq=False, forbid_unknown_fields=T
 
     @property
     def sem(self) -> float:
-        """Standard error of that mean."""
+        """Standard error of `mean`."""
         return standard_error(self.pooled, self.ddof)
 
     @property
@@ -95,10 +96,11 @@ class Consistency(msgspec.Struct, frozen=True, eq=False, forbid_unknown_fields=T
 
 
 class Benchmark(msgspec.Struct, frozen=True, eq=False, forbid_unknown_fields=True):
-    """A frozen benchmark.
+    """A frozen benchmark: the targets that models are scored against, and their consistency.
 
     Attributes:
-        pooled: All animals as one further target of paper-code; None under strict.
+        pooled: All animals as one further target for paper-code; None for strict.
+        a2a: The consistency between animals.
     """
 
     protocol: str
@@ -118,7 +120,7 @@ class Benchmark(msgspec.Struct, frozen=True, eq=False, forbid_unknown_fields=Tru
 
     @property
     def reliable(self) -> tuple[Target, ...]:
-        """Animals that count in a mean."""
+        """Animals that count in mean scores."""
         return tuple(target for target in self.targets if target.reliable)
 
 
@@ -136,15 +138,15 @@ def benchmark_sha256(benchmark: Benchmark) -> str:
 
 
 def save_benchmark(benchmark: Benchmark, path: Path) -> None:
-    """Write a benchmark as JSON, whole or not at all."""
+    """Write a benchmark to a JSON file, atomically."""
     write_json(_File(benchmark, benchmark_sha256(benchmark)), path)
 
 
 def load_benchmark(path: Path) -> Benchmark:
-    """Read a benchmark.
+    """Read and check a benchmark from its JSON file.
 
     Raises:
-        ConfigError: no such file, another version, a wrong field, or changed content.
+        ConfigError: the file is missing, of another version, invalid, or changed since the build.
     """
     file = read_json(path, _File, "tactile-rt align build")
     if file.sha256 != benchmark_sha256(file.benchmark):
@@ -154,7 +156,7 @@ def load_benchmark(path: Path) -> Benchmark:
 
 
 def load_strict(path: Path) -> Benchmark:
-    """Read a benchmark of protocol strict: gate and decoder need named stimuli."""
+    """Read a benchmark; check that its protocol is strict, whose stimuli have names."""
     benchmark = load_benchmark(path)
     if benchmark.protocol != "strict":
         raise ConfigError(
@@ -165,10 +167,10 @@ def load_strict(path: Path) -> Benchmark:
 
 
 def check_benchmark(benchmark: Benchmark, path: Path) -> None:
-    """Check a benchmark beyond the types of its fields.
+    """Check the values and shapes of a benchmark's fields.
 
     Raises:
-        ConfigError: an unknown protocol, invalid stimuli, or tables that do not fit.
+        ConfigError: the protocol is unknown, stimuli are invalid, or shapes do not match.
     """
     if benchmark.protocol not in PROTOCOLS:
         raise ConfigError(f"{path}: no protocol {benchmark.protocol!r}: {', '.join(PROTOCOLS)}")

@@ -1,4 +1,4 @@
-"""The board of models by datasets by metrics, in shares of the noise ceiling.
+"""The board: a table of models by datasets and metrics, in shares of the noise ceiling.
 
 In every cell a model's layer is chosen on the other animals (`statistics.held_out`), so that no
 value is a maximum over layers. Controls are rows as well: the sensors' readings, each network
@@ -22,13 +22,13 @@ from tactile_rt.alignment.selection import part_of
 from tactile_rt.alignment.statistics import held_out, standard_error
 from tactile_rt.alignment.stimuli_input import StimuliInput
 
-Traces = Mapping[str, Floats]  # by layer, (6, step, unit), NaN where input cannot reach
+Traces = Mapping[str, Floats]  # by layer, (6, step, unit), NaN in steps that no input reaches
 
 ANOTHER = "another animal"
 
 
 class BoardRow(msgspec.Struct, frozen=True):
-    """A model or control that is compared with the recordings."""
+    """A row of a board: a model or control that is compared with the recordings."""
 
     name: str
     # kind of row: ``model``, ``untrained``, ``input`` (the sensors' readings) or ``animal``
@@ -39,29 +39,29 @@ class BoardRow(msgspec.Struct, frozen=True):
 
 
 class BoardColumn(msgspec.Struct, frozen=True):
-    """One part of a dataset under one metric."""
+    """A column of a board: one part of a dataset, under one metric."""
 
     dataset: str
     part: str
     metric: str
     animals: int
-    usable: int  # number of animals whose noise is low enough to be corrected for
-    # mean ceiling over these, which a perfect model is expected to reach; NaN without any
+    usable: int  # number of animals with a usable noise ceiling, see `Measure`
+    # mean ceiling of these animals, which a perfect model is expected to reach; NaN without any
     ceiling: Number
 
 
 class BoardCell(msgspec.Struct, frozen=True):
-    """A row's value in a column."""
+    """The value of one row in one column of a board."""
 
     # mean over animals of the value as a share of the ceiling; NaN without a value
     score: Number = math.nan
-    sem: Number = math.nan  # standard error of that mean; NaN with fewer than two animals
-    value: Number = math.nan
-    layer: str = ""
+    sem: Number = math.nan  # standard error of `score`; NaN with fewer than two animals
+    value: Number = math.nan  # mean over animals of the metric's value
+    layer: str = ""  # layer that is chosen for most animals
 
 
 class BoardDataset(msgspec.Struct, frozen=True):
-    """A dataset's origin, as in `datasets.NeuralDataset`, and the animals and units read."""
+    """A dataset's origin, as in `datasets.NeuralDataset`, and its animals and number of units."""
 
     name: str
     title: str
@@ -76,7 +76,7 @@ class BoardDataset(msgspec.Struct, frozen=True):
 
 
 class Alignments(msgspec.Struct, frozen=True, tag_field="kind", tag="tactile_rt board 2"):
-    """All rows, columns and cells of a board."""
+    """The content of a board: its rows, columns and cells, and its datasets and metrics."""
 
     rows: tuple[BoardRow, ...]
     columns: tuple[BoardColumn, ...]
@@ -86,7 +86,7 @@ class Alignments(msgspec.Struct, frozen=True, tag_field="kind", tag="tactile_rt 
 
 
 def traces_of(layers: Layers) -> Traces:
-    """Return responses for metrics, NaN in the steps before input reaches the layer.
+    """Convert layers to traces for metrics: NaN in the steps that input has not reached.
 
     A layer with one response per stimulus, computed elsewhere, gets that response in every step.
     """
@@ -99,7 +99,7 @@ def traces_of(layers: Layers) -> Traces:
 
 
 def traces_of_stimuli(stimuli: StimuliInput) -> Traces:
-    """Return the loads themselves as a layer, averaged over each step's samples, SI."""
+    """Return the loads, averaged over each step's samples, SI, as a layer "raw"."""
     steps = stimuli.samples.astype(np.float64).mean(axis=2)
     return {"raw": steps.reshape(*steps.shape[:2], -1)}
 
@@ -113,16 +113,16 @@ def with_cells(
     notes: Iterable[str] = (),
     progress: Callable[[float], None] = lambda share: None,
 ) -> Alignments:
-    """Compute the board of one dataset: the given rows, and another animal as model.
+    """Compute the board of one dataset: the given rows, and another animal last.
 
     Args:
-        rows: each with its layers' responses to the dataset's conditions.
+        rows: models and controls, each with its layers' responses to the dataset's conditions.
     """
     from threadpoolctl import threadpool_limits
 
     columns: list[BoardColumn] = []
     cells: list[list[BoardCell]] = [[] for _ in range(len(rows) + 1)]
-    # Matrices are small: more threads only wait for each other, on a busy machine for minutes.
+    # One thread: matrices are small, and more threads would wait for each other, maybe minutes.
     with threadpool_limits(1):
         for done, (part, metric) in enumerate((p, m) for p in parts for m in metrics):
             targets = part_of(animals, part)
@@ -149,7 +149,7 @@ def with_cells(
 
 
 def join_boards(boards: Sequence[Alignments]) -> Alignments:
-    """Join boards of the same rows side by side."""
+    """Join boards with the same rows into one, with the columns of all."""
     return msgspec.structs.replace(
         boards[0],
         columns=tuple(column for board in boards for column in board.columns),
@@ -175,7 +175,7 @@ def _make_cell(traces: Traces, measures: Sequence[Measure]) -> BoardCell:
 
 
 def _compare_animals(animals: Sequence[tuple[Animal, Measure]]) -> BoardCell:
-    """Score each animal by the mean fit of the other animals to it."""
+    """Score the other animals as models of each animal: the mean of their fits."""
     scores, raw = [], []
     for target, measure in animals:
         found = [measure.fit(_convert_to_layer(a)) for a, _ in animals if a is not target]
@@ -189,7 +189,7 @@ def _compare_animals(animals: Sequence[tuple[Animal, Measure]]) -> BoardCell:
 
 
 def _convert_to_layer(animal: Animal) -> Floats:
-    """Return mean responses (stimulus, bin, unit); without a time course, alike in all bins."""
+    """Return an animal's mean responses (stimulus, bin, unit), to be scored as a layer."""
     sessions = sessions_of(animal)
     means = means_of(sessions, bins_of(sessions))
     return np.repeat(means, LONGEST, axis=1) if means.shape[1] == 1 else means

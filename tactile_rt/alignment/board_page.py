@@ -1,4 +1,4 @@
-"""The alignment board as one HTML page."""
+"""Formatting of an alignment board as one HTML page."""
 
 from html import escape
 
@@ -21,7 +21,7 @@ KINDS = {
 
 
 def board_page(board: Alignments) -> str:
-    """Show a board as HTML."""
+    """Format a board as an HTML page; return its text."""
     key = "".join(
         f'<i style="background:var(--{kind})"></i>{escape(what)}'
         for kind, what in KINDS.items()

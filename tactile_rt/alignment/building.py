@@ -1,4 +1,4 @@
-"""Building of a frozen benchmark from recordings."""
+"""Construction of a frozen benchmark from recordings."""
 
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -25,7 +25,7 @@ from tactile_rt.core.errors import ConfigError, name_some
 from tactile_rt.core.stream.stimuli import STIMULI
 
 READING = 0.8  # share of a build's time; the rest is bootstraps
-# Two sessions are copies if they share more than `MOST` of the smaller one's trials or units.
+# Two sessions are copies if they share more than `MOST` of the trials or units of the smaller.
 MOST = 0.5
 FEWEST = 3  # trials or units needed to compare sessions, and different rates to compare units
 
@@ -45,16 +45,16 @@ def build(
         inputs: NWB files and folders of them; or, for stimuli of any names, one ``.npz`` or two
             tables (`named_recordings`); or, for paper-code, the published ``.npz``.
         progress: called with the share done, 0 to 1.
-        selection: which sessions and units to keep; None for all.
-        clock: the clock of spike times: the ``session``'s, as in NWB and by default for strict, or
-            the ``recording``'s, as in the published analysis and by default for paper-code.
+        selection: the sessions and units to keep; None for all.
+        clock: the clock of spike times: ``session``, as in NWB and by default for strict, or
+            ``recording``, as in the published analysis and by default for paper-code.
 
     Returns:
-        A benchmark with at least one reliable animal. Its notes begin with the result of the check
-        of the clock, and list what was left out.
+        A benchmark with at least one reliable animal. Its notes begin with the result of the clock
+        check, and list sessions, trials and units that were left out.
 
     Raises:
-        ConfigError: recordings that cannot be used: no animal is reliable, a session is given
+        ConfigError: the recordings cannot be used: no animal is reliable, a session is given
             twice, or, under strict, contacts show that spikes are on another clock.
     """
     if protocol not in PROTOCOLS:
@@ -132,7 +132,7 @@ def checked_sessions(
     clock: str | None = None,
     selection: Selection | None = None,
 ) -> tuple[list[NeuralSession], list[str]]:
-    """Read sessions of NWB files, check their clocks, and refuse copies.
+    """Read sessions of NWB files, check clocks and copies; return sessions and notes.
 
     Args:
         strict: True to count rates from first contact, and leave out sessions whose contacts show
@@ -157,7 +157,7 @@ def checked_sessions(
 def _check_clock(
     readings: list[Reading], clock: str, strict: bool
 ) -> tuple[list[Reading], list[str]]:
-    """Return the readings whose contacts do not contradict the clock, and notes on the check."""
+    """Check spikes' clock by contacts; return readings to keep, and notes on the check."""
     responses = [r.response for r in readings if r.response is not None]
     if not responses:
         return readings, [
@@ -183,7 +183,7 @@ def _check_clock(
 
 
 def _keep_complete(sessions: Sequence[NeuralSession], notes: list[str]) -> list[NeuralSession]:
-    """Keep the sessions with every stimulus, which paper-code needs, and note the others."""
+    """Return the sessions with every stimulus, which paper-code needs; note the others."""
     kept = []
     for session in sessions:
         missing = [name for name, n in zip(STIMULI, session.trials, strict=True) if not n]
@@ -199,11 +199,11 @@ def _keep_complete(sessions: Sequence[NeuralSession], notes: list[str]) -> list[
 
 
 def refuse_copies(sessions: Sequence[NeuralSession]) -> None:
-    """Refuse a session given twice, even with another spike sorting, order or fewer units.
+    """Check that no session is given twice, even with another spike sorting or order.
 
     Two copies of a session would be split into the same halves and agree with each other perfectly.
-    Two sessions are copies if they share, in any order, most of their trials (time of beginning and
-    stimulus), or most of their units (the counts of their rates for each stimulus).
+    Two sessions are copies if they share, in any order, most of their trials (start time and
+    stimulus), or most of their units (the sorted rates for each stimulus).
     """
     trials = [_count_trials(session) for session in sessions]
     units = [_count_units(session) for session in sessions]
@@ -219,13 +219,13 @@ def refuse_copies(sessions: Sequence[NeuralSession]) -> None:
 
 
 def _share_most(one: Counter[bytes], other: Counter[bytes]) -> bool:
-    """Return whether two counters share most of the smaller one's items."""
+    """Return whether two counters share most items of the smaller counter."""
     fewer = min(one.total(), other.total())
     return fewer >= FEWEST and (one & other).total() > MOST * fewer
 
 
 def _count_trials(session: NeuralSession) -> Counter[bytes]:
-    """Count trials by the time of their beginning, rounded to 1 ms, and their stimulus."""
+    """Count trials by start time, rounded to 1 ms, and stimulus; empty without times."""
     if session.begin is None:
         return Counter()
     began = np.round(session.begin * 1e3).astype(np.int64)
@@ -233,7 +233,7 @@ def _count_trials(session: NeuralSession) -> Counter[bytes]:
 
 
 def _count_units(session: NeuralSession) -> Counter[bytes]:
-    """Count units by their rates, sorted within stimuli, if three or more rates differ."""
+    """Count units by their rates, sorted within stimuli; skip units with few distinct rates."""
     found: Counter[bytes] = Counter()
     for rates in session.rates.T:
         if len(np.unique(rates)) >= FEWEST:
@@ -243,11 +243,11 @@ def _count_units(session: NeuralSession) -> Counter[bytes]:
 
 
 def animal_means(path: Path) -> tuple[dict[str, NDArray[np.float64]], list[str]]:
-    """Read the mean responses (6, unit) of animals, and notes on what was left out.
+    """Read the mean responses (6, unit) by animal, and notes on what was left out.
 
     Args:
-        path: an NWB file, or a folder of them; or ``.npz``, rates in the layout that their authors
-            published, mistakes included (`neural.published_layout`).
+        path: an NWB file, or a folder of NWB files; or an ``.npz`` of rates in the published
+            layout, mistakes included (`neural.published_layout`).
     """
     if path.suffix == ".npz":
         return {name: trial_mean(rates) for name, rates in read_published(path).items()}, []

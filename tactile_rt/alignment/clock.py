@@ -1,11 +1,11 @@
 """Check of the clock of spikes: rates must rise 3 to 40 ms after contact.
 
-Barrel cortex answers a touch within milliseconds, so the recording itself shows whether its spikes
-and its contacts are on one clock.
+Barrel cortex responds to a touch within milliseconds, so the recording itself shows whether its
+spikes and its contacts are on one clock.
 
-- *Contacts* count only if they begin a bout, with none in the 250 ms before: the rate before them
-  is then a baseline, and the rhythm of whisking cannot make another shift look right.
-- *The rise* is the number of spikes 3 to 40 ms after contact less that in as long a time before.
+- *Contacts* count only if they begin a bout, without a contact in the 250 ms before: the rate
+  before is then a baseline, and the rhythm of whisking cannot make another shift look right.
+- *The rise* is the number of spikes 3 to 40 ms after contact, minus that in an equal time before.
 - *Chance* is measured by shifting spikes against contacts by up to 20 s, or somewhat more than the
   recording's starting time: z is the rise in units of the spread of the rises over all shifts. Slow
   changes of the rate, such as with the trials, cancel in the difference.
@@ -22,12 +22,12 @@ from numpy.typing import NDArray
 from tactile_rt.alignment.rdm import Floats
 
 CLOCKS = ("session", "recording")  # as in NWB; shifted by the starting time, as published
-WARNING = "WARNING: "  # begins a note that must not be overlooked
+WARNING = "WARNING: "  # prefix of notes that the user must read
 
 APART_S = 0.25  # least time between a contact that counts and the previous one
 RISE_MS = (3, 40)
 BEFORE_MS, AFTER_MS = 40, 60  # extent of the histogram before and after contact
-BEFORE = slice(BEFORE_MS - RISE_MS[1], BEFORE_MS - RISE_MS[0])  # its parts that are compared
+BEFORE = slice(BEFORE_MS - RISE_MS[1], BEFORE_MS - RISE_MS[0])  # parts of it that are compared
 AFTER = slice(BEFORE_MS + RISE_MS[0], BEFORE_MS + RISE_MS[1])
 BIN_S = 0.002  # bin width in the search for another shift
 HERE_S = 0.03  # a shift up to this counts as none
@@ -39,22 +39,22 @@ ELSEWHERE_Z, CLEARLY = 7.0, 1.5  # least z of another clock, also as a multiple 
 
 @dataclass(frozen=True, eq=False)
 class ContactResponse:
-    """The change of rates with contact, in one session or several."""
+    """The change of firing rates with contact, measured in one session or several."""
 
     session: str
     shift_s: float  # shift that was subtracted from the stored spike times, in s
     # (100,) number of spikes of all units in each ms from 40 ms before to 60 ms after contact
     histogram: NDArray[np.int64]
     windows: int  # number of contacts times the number of units
-    rise: float  # number of spikes 3 to 40 ms after contact less that in as long a time before
-    spread: float  # spread of that number over other shifts, by chance alone
+    rise: float  # number of spikes 3 to 40 ms after contact, minus that in an equal time before
+    spread: float  # standard deviation of the rise over other shifts, by chance alone
     # shift in s to subtract from the stored spike times: the best one other than `shift_s`
     other_s: float = 0.0
     other_z: float = 0.0  # rise at that shift, in units of `spread`
 
     @property
     def z(self) -> float:
-        """Rise in units of its spread by chance; 0 if there is no spread."""
+        """Rise divided by its standard deviation by chance; 0 if that is 0."""
         return self.rise / self.spread if self.spread > 0 else 0.0
 
     @property
@@ -64,7 +64,7 @@ class ContactResponse:
 
     @property
     def elsewhere(self) -> bool:
-        """True if another shift fits clearly better."""
+        """True if another shift of spike times fits the contacts clearly better."""
         return self.other_z >= max(ELSEWHERE_Z, CLEARLY * self.z)
 
     @property
@@ -75,7 +75,7 @@ class ContactResponse:
         return float(np.argmax(after >= (base + after.max()) / 2) + 0.5) * 1e-3
 
     def rate_hz(self, part: slice) -> float:
-        """Return the mean rate of a unit in a part of the histogram, spikes/s."""
+        """Return the mean rate per unit in a part of the histogram, spikes/s."""
         time_s = self.windows * (part.stop - part.start) * 1e-3
         return float(self.histogram[part].sum() / time_s) if time_s else 0.0
 
@@ -87,11 +87,11 @@ def contact_response(
     shift_s: float = 0.0,
     starting_time_s: float = 0.0,
 ) -> ContactResponse | None:
-    """Measure the change of a session's rates with contact.
+    """Measure the change of a session's firing rates with contact.
 
     Args:
         spikes: (spike,) stored times of each unit in s, finite.
-        contacts: (contact,) times when contacts begin in s, finite and sorted.
+        contacts: (contact,) start times of contacts in s, finite and sorted.
         shift_s: shift to subtract from the stored times.
         starting_time_s: starting time of the electrical recording; the search reaches beyond it.
 
@@ -128,7 +128,7 @@ def contact_response(
 
 
 def _search_shifts(times: Floats, contacts: Floats, reach: float) -> tuple[Floats, Floats]:
-    """Return shifts, s, and the rise after contact with each subtracted from spike times."""
+    """Compute the rise after contact for each shift (s) subtracted from spike times."""
     begin = contacts[0] - 2 * reach
     bins = int((contacts[-1] - contacts[0] + 4 * reach) / BIN_S) + 2
 
@@ -147,7 +147,7 @@ def _search_shifts(times: Floats, contacts: Floats, reach: float) -> tuple[Float
 
 
 def said_of(responses: Sequence[ContactResponse], clock: str) -> str:
-    """Summarise responses in a line: clock, rates around contact, latency, effect."""
+    """Format responses as one line: clock, rates before and after contact, latency, effect."""
     whole = ContactResponse(
         session="all",
         shift_s=0.0,

@@ -27,10 +27,10 @@ TIE = 1e-9
 
 @dataclass(frozen=True)
 class Decoded:
-    """Accuracies on held-out stimuli, 0 to 1; NaN for responses that have no RDM.
+    """Accuracies of decoding held-out stimuli, 0 to 1; NaN for responses without an RDM.
 
-    With each accuracy: the mean accuracy over all relabellings of the stimuli (chance), and the
-    share of these that are at least as accurate as the true labels (p).
+    For each accuracy, `chance` is the mean accuracy over all relabellings of the stimuli, and `p`
+    the share of relabellings that are at least as accurate as the true labels.
     """
 
     shape: float
@@ -47,7 +47,7 @@ def decode(patterns: ArrayLike) -> Decoded:
 
 
 def decode_rdm(entries: ArrayLike) -> Decoded:
-    """Decode as `decode` does, but from an RDM (15,), which has the stimuli's distances.
+    """Decode shape and distance by the nearest class mean, from an RDM (15,).
 
     The null distribution is exact: all 720 relabellings, the true labels included.
     """
@@ -64,7 +64,7 @@ def decode_rdm(entries: ArrayLike) -> Decoded:
 
 
 def decode_paper(patterns: ArrayLike) -> Decoded:
-    """Decode as the paper (Table "Stimuli decoding"), by leave-one-out logistic regression.
+    """Decode responses (6, unit) by the paper's method: leave-one-out logistic regression.
 
     Chance is the mean over all divisions of the stimuli into classes of the same sizes.
     """
@@ -77,7 +77,7 @@ def decode_paper(patterns: ArrayLike) -> Decoded:
     from threadpoolctl import threadpool_limits  # comes with scikit-learn
 
     found = []
-    # With five points, threads only wait for each other, for minutes on a busy machine.
+    # One thread: with five points, threads only wait for each other, for minutes if busy.
     with threadpool_limits(1):
         for labels in (SHAPE, DISTANCE):
             right = np.array([_leave_one_out(reduced, other) for other in _list_divisions(labels)])
@@ -86,9 +86,9 @@ def decode_paper(patterns: ArrayLike) -> Decoded:
 
 
 def mean_decoded(several: Sequence[Decoded]) -> Decoded:
-    """Average over the animals with accuracies, as the paper's table does; p is NaN.
+    """Average accuracies and chance levels over animals, as in the paper's table.
 
-    Without such an animal, all values are NaN.
+    Animals without accuracies are left out; p is NaN, and without any animal so are all values.
     """
     finite = [one for one in several if math.isfinite(one.shape)]
     nan = math.nan
@@ -102,7 +102,7 @@ def mean_decoded(several: Sequence[Decoded]) -> Decoded:
 
 
 def _score_nearest(squares: Floats, labels: NDArray[np.intp], folds: NDArray[np.intp]) -> Floats:
-    """Compute accuracies (...) from squared distances (..., 6, 6); ties count as guesses."""
+    """Compute nearest-mean accuracies (...) from squared distances; ties count as guesses."""
     right: Floats = np.zeros(squares.shape[:-2])
     for fold in np.unique(folds):
         tested = np.flatnonzero(folds == fold)
@@ -122,7 +122,7 @@ def _score_nearest(squares: Floats, labels: NDArray[np.intp], folds: NDArray[np.
 
 
 def _leave_one_out(values: Floats, labels: Labels) -> float:
-    """Return the leave-one-out accuracy of logistic regression."""
+    """Return the leave-one-out accuracy of logistic regression on values (stimulus, feature)."""
     from sklearn.linear_model import LogisticRegression
 
     goal = np.array(labels)
@@ -136,7 +136,7 @@ def _leave_one_out(values: Floats, labels: Labels) -> float:
 
 @cache
 def _list_divisions(labels: Labels) -> tuple[Labels, ...]:
-    """List all partitions of the stimuli into groups of these sizes, the given one first."""
+    """List all partitions of the stimuli into classes of the sizes in `labels`, `labels` first."""
 
     def renumber(order: Labels) -> Labels:
         names: dict[int, int] = {}

@@ -1,4 +1,4 @@
-"""A made-up brain with known truth, for trying and validating the benchmark.
+"""A synthetic brain with known ground truth, to try and validate the benchmark.
 
 - *Geometry.* Six stimuli are points in a space of `FEATURES` features, placed by distance, by shape
   and at random. Each mouse has this shared geometry, except for a share `private` of the features'
@@ -8,7 +8,7 @@
 - *Damage.* A model that lost a share d of the shared variance has private variance instead. At
   d = 0 it is another mouse, at d = 1 it shares nothing.
 
-Every random number comes from one seed.
+All random numbers depend on one seed.
 """
 
 from collections.abc import Mapping
@@ -24,9 +24,9 @@ from tactile_rt.core.stream.stimuli import DISTANCES, SHAPES, STIMULI
 FEATURES = 6
 # Median rate of units in spikes per second, and the spread of its logarithm over units.
 MIDDLE_HZ, SPREAD = 5.0, 0.8
-GAIN_SHAPE = 8.0  # of the gamma distribution of a trial's gain: a standard deviation of 35 %
-# Share of each layer's variance that comes from the model's geometry: the first layer is random,
-# the last is the best.
+GAIN_SHAPE = 8.0  # shape of the gamma distribution of trials' gains: 35 % standard deviation
+# Share of each layer's variance that comes from the model's geometry: none in the first layer, all
+# in the last.
 LAYERS = (0.0, 0.4, 0.7, 1.0)
 LAYER_UNITS = 200
 # Share of the shared variance that each of the example's models has lost.
@@ -35,7 +35,7 @@ MODELS = {"another-mouse": 0.0, "lost-25": 0.25, "lost-50": 0.5, "random": 1.0}
 
 @dataclass(frozen=True)
 class Brain:
-    """The recorded mice, sessions, units and trials, and the parameters of their responses."""
+    """Parameters of the synthetic brain: its size, and the statistics of its responses."""
 
     mice: int = 11
     sessions: int = 2  # of each mouse; each session has other units
@@ -66,26 +66,26 @@ class Brain:
         )
 
     def features(self, rng: np.random.Generator, shared: Floats, lost: float = 0.0) -> Floats:
-        """Draw features (6, feature) of a mouse that lost a share of the shared variance."""
+        """Draw a mouse's features (6, feature), with a share `lost` of shared variance replaced."""
         kept = (1 - self.private) * (1 - lost)
         own = _standardise(rng.normal(size=shared.shape))
         return np.asarray(np.sqrt(kept) * shared + np.sqrt(1 - kept) * own)
 
     def rates(self, rng: np.random.Generator, features: Floats, units: int) -> Floats:
-        """Draw units and return their rates (6, unit) without noise, in spikes per second."""
+        """Draw units; return their mean rates (6, unit) for the stimuli, in spikes per second."""
         weights = rng.normal(size=(features.shape[1], units)) / np.sqrt(features.shape[1])
         level = np.log(MIDDLE_HZ) + SPREAD * rng.normal(size=units)
         return np.asarray(np.exp(level + self.tuning * features @ weights))
 
     def animals(self, rng: np.random.Generator, shared: Floats) -> tuple[Animal, ...]:
-        """Draw all mice, recorded in trials of 1 s each, without writing files."""
+        """Draw recordings of all mice, with trials of 1 s, in memory."""
         return tuple(
             self.animal(rng, self.features(rng, shared), f"mouse-{k + 1:02d}")
             for k in range(self.mice)
         )
 
     def animal(self, rng: np.random.Generator, features: Floats, name: str) -> Animal:
-        """Draw the recordings of a mouse of given features."""
+        """Draw the recorded sessions of a mouse with given features (6, feature)."""
         sessions = []
         for k in range(self.sessions):
             rates = self.rates(rng, features, self.units)
@@ -95,7 +95,7 @@ class Brain:
         return Animal(name, tuple(sessions))
 
     def model(self, rng: np.random.Generator, features: Floats) -> dict[str, Floats]:
-        """Draw a model's layers by name from its features: responses (6, unit) without noise."""
+        """Draw a model with given features: responses (6, unit), without noise, by layer."""
         base = self.rates(rng, features, LAYER_UNITS)
         return {
             f"encoder.layer{k}": _blend(base, _draw_alike(rng, base), kept)
@@ -106,14 +106,14 @@ class Brain:
 def example_models(
     brain: Brain, rng: np.random.Generator, shared: Floats
 ) -> Mapping[str, dict[str, Floats]]:
-    """Draw the models of known truth in `MODELS`, each as its layers by name."""
+    """Draw the example models in `MODELS`: responses (6, unit) by model and layer."""
     return {
         name: brain.model(rng, brain.features(rng, shared, lost)) for name, lost in MODELS.items()
     }
 
 
 def gains(rng: np.random.Generator, trials: int) -> Floats:
-    """Draw the gain of every trial, (trial,), with mean one."""
+    """Draw a random gain (trial,) for each trial, with mean 1."""
     return rng.gamma(GAIN_SHAPE, 1 / GAIN_SHAPE, size=trials)
 
 
@@ -123,7 +123,7 @@ def _standardise(values: Floats) -> Floats:
 
 
 def _draw_alike(rng: np.random.Generator, rates: Floats) -> Floats:
-    """Draw random responses with the same unit means and variance over stimuli as the given."""
+    """Draw random responses with the unit means and the variance over stimuli of `rates`."""
     level = rates.mean(axis=0)
     spread = np.sqrt(((rates - level) ** 2).mean())
     return np.asarray(level + spread * _standardise(rng.normal(size=rates.shape)))

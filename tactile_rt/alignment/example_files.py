@@ -1,9 +1,9 @@
-"""Files of the made-up brain: NWB sessions like the real recordings, and models to score.
+"""Files of the synthetic brain: NWB sessions like the real recordings, and models to score.
 
-A trial lasts four seconds. Whiskers touch a few times between its first contact and the choice.
+A trial lasts four seconds. Whiskers touch a few times between first contact and choice.
 From `LATENCY_S` after first contact to the choice a unit fires at its rate for the stimulus, mostly
-just after each contact; outside, at a third of its mean rate. Spikes are on the session's clock, as
-NWB defines: the electrical recording begins at `BEGIN_S` on that clock, without spikes before.
+just after each contact; at other times, at a third of its mean rate. Spikes are on the session's
+clock, as NWB defines; the electrical recording begins at `BEGIN_S`, without spikes before.
 """
 
 import json
@@ -27,18 +27,18 @@ if TYPE_CHECKING:
     import h5py
 
 TRIAL_S = 4.0
-FIRST_S, BEGIN_S = 5.9, 10.03  # beginning of the first trial and of the electrical recording
-CONTACT_S, CHOICE_S = (0.8, 1.2), (0.8, 1.2)  # first contact after the start; choice after contact
-CONTACTS = 3  # mean number in a trial, after the first
+FIRST_S, BEGIN_S = 5.9, 10.03  # start of the first trial and of the electrical recording
+CONTACT_S, CHOICE_S = (0.8, 1.2), (0.8, 1.2)  # from start to first contact; from it to choice
+CONTACTS = 3  # mean number of contacts in a trial, after the first
 LATENCY_S, BURST_S = 0.005, 0.035  # from a contact to its burst, and the length of the burst
 BURST = 3.0  # rate in a burst, as a multiple of the rate between bursts
 REST = 1 / 3  # rate without contact, as a share of a unit's mean rate
-WRONG = 12  # trials of every session that end in error; they do not count
+WRONG = 12  # additional trials of every session that end in error, and so do not count
 SAMPLING_HZ, WHISKER_HZ = 30_000.0, 200.0
 WHISKERS = ("C0", "C1", "C2", "C3")
 DATE = "2020-01-01T00:00:00+00:00"
 DEPTHS_UM = (100.0, 1100.0)
-INHIBITORY = 0.2  # probability of each unit
+INHIBITORY = 0.2  # probability that a unit is inhibitory
 
 
 def write_example(
@@ -47,15 +47,15 @@ def write_example(
     seed: int = 0,
     progress: Callable[[float], None] = lambda share: None,
 ) -> tuple[Path, Path]:
-    """Write recordings of a made-up brain, and models of known truth.
+    """Write recordings of a synthetic brain, and models whose true scores are known.
 
     Args:
         folder: the folder to make; it must not exist.
-        seed: of all random numbers, 0 or more.
+        seed: seed of all random numbers, 0 or more.
 
     Returns:
-        The folder of NWB files, one a session, and the folder of models, ``.npz`` of responses
-        (6, unit) by layer. ``truth.json`` beside them holds the parameters and the truth.
+        The folder of NWB files, one per session, and the folder of models, ``.npz`` of responses
+        (6, unit) by layer. ``truth.json`` in `folder` holds the parameters and the true geometry.
 
     Raises:
         ConfigError: the folder exists, or the seed is below 0.
@@ -96,11 +96,11 @@ def write_example(
 def _write_session(
     file: "h5py.File", rng: np.random.Generator, animal: str, rates: Floats, trials: int
 ) -> None:
-    """Write a session of units of given rates (6, unit), in spikes per second."""
+    """Write a session to an NWB file, for units with mean rates (6, unit), spikes/s."""
     n = len(STIMULI) * trials + WRONG
     stimulus = rng.permutation(np.resize(np.arange(len(STIMULI)), n))
     correct = np.zeros(n, dtype=np.bool_)
-    for k in range(len(STIMULI)):  # the requested number of correct trials for each
+    for k in range(len(STIMULI)):  # `trials` correct trials of each stimulus
         correct[rng.permutation(np.flatnonzero(stimulus == k))[:trials]] = True
     start = FIRST_S + TRIAL_S * np.arange(n)
     first = start + rng.uniform(*CONTACT_S, size=n)
@@ -142,7 +142,7 @@ def _draw_unit(
     choice: Floats,
     end: float,
 ) -> Floats:
-    """Draw spike times, s, at a unit's rate (trial,) from contact to choice, else `REST`."""
+    """Draw a unit's spike times, s, at `rate` (trial,) in trials, else at rest."""
     begin = np.array([times[0] for times in contacts]) + LATENCY_S
     bursts = np.array([len(times) for times in contacts]) * BURST_S
     # Between bursts the rate is lower, so that a trial keeps its mean rate.
@@ -167,7 +167,7 @@ def _draw_unit(
 
 
 def _draw_spikes(rng: np.random.Generator, begin: Floats, length: Floats, rate: Floats) -> Floats:
-    """Draw Poisson spike times at given rates in windows, (window,) each."""
+    """Draw Poisson spike times in windows of given begin, length and rate (window,)."""
     number = rng.poisson(rate * length)
     return np.asarray(
         np.repeat(begin, number) + rng.random(number.sum()) * np.repeat(length, number)

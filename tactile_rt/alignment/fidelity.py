@@ -1,6 +1,6 @@
-"""Fidelity of exports: comparison of an exported model's layers with those of its original.
+"""Fidelity of exports: comparison of the layers of an exported model and its original.
 
-It needs no neural data: two files of one network, six stimuli, and the RDM of every layer in both.
+It needs no neural data, only two files of one network: the RDM of every layer for the six stimuli.
 """
 
 from collections.abc import Sequence
@@ -18,12 +18,12 @@ OUTPUT = "output"
 LEAST_PEARSON = {"fp32": 0.9999}
 REDUCED_PEARSON = 0.98  # for any other precision
 LARGEST_DIFFERENCE = 1e-5
-FLAT = 1e-6  # an RDM of a smaller range is meaningless: with two classes the output's may be zeros
+FLAT = 1e-6  # an RDM with a smaller range is meaningless, e.g. all 0 for an output of two classes
 
 
 @dataclass(frozen=True)
 class LayerFidelity:
-    """The comparison of a layer in both models."""
+    """The result of comparing a layer between the reference and the exported model."""
 
     layer: str
     # correlation of the two RDMs of the layer; NaN if one is missing or both are flat
@@ -35,7 +35,7 @@ class LayerFidelity:
 
 
 def compare(reference: Layers, exported: Layers) -> tuple[LayerFidelity, ...]:
-    """Compare every layer that both models have, and the output."""
+    """Compare every layer that both models have, and their outputs."""
     ours, theirs = reference.patterns, exported.patterns
     begin = reference.first.get("decoder.logits", 0)
     for layers, patterns in ((reference, ours), (exported, theirs)):
@@ -48,7 +48,7 @@ def compare(reference: Layers, exported: Layers) -> tuple[LayerFidelity, ...]:
 
 
 def fidelity_check(reference: Layers, exported: Layers) -> tuple[Check, tuple[LayerFidelity, ...]]:
-    """Run test 4 of the gate; return its result and the comparison of every layer."""
+    """Run the fidelity test of the gate; return the result and each layer's comparison."""
     rows = compare(reference, exported)
     layers = [row for row in rows if row.layer != OUTPUT]
     missing = [name for name in reference.traces if name not in exported.traces]
@@ -72,12 +72,12 @@ def fidelity_check(reference: Layers, exported: Layers) -> tuple[Check, tuple[La
 
 
 def export_layers(path: Path, stimuli: StimuliInput, reference: Layers) -> Layers:
-    """Read the layers of an ONNX file for a comparison with a reference."""
+    """Run an ONNX file on the stimuli; return its layers for comparison with a reference."""
     from tactile_rt.alignment.onnx_activations import onnx_layers
 
     exported, _ = onnx_layers(path, stimuli)
-    # The reference knows the first step at which input reaches a layer. An ONNX file shows it only
-    # by differences, which are below single precision in a network that hardly responds.
+    # In the reference the first step at which input reaches a layer is known. An ONNX file reveals
+    # it only by differences, below single precision in a network that hardly responds.
     known = {k: step for k, step in reference.first.items() if k in exported.traces}
     return replace(exported, first={**exported.first, **known})
 

@@ -1,9 +1,9 @@
 """The release gate of a model: four tests, and the exit code for a pipeline.
 
 1. validity: the benchmark has enough reliable animals.
-2. NeuroAI Turing test: the model is not worse than another mouse, shown to be near one, and better
-   than chance, see below.
-3. regression: not worse than a stored model on the same animals.
+2. NeuroAI Turing test: the model is not worse than another mouse, within a margin of the noise
+   ceiling, and better than chance, see below.
+3. regression: the model is not worse than a stored model on the same animals.
 4. export fidelity (`fidelity`), which needs no neural data.
 
 The Turing test compares the model's mean fit to single mice with each mouse's mean fit to the
@@ -16,12 +16,12 @@ which a perfect model of a mouse is expected to reach.
   similarity"). The weight is the inverse of that covariance, computed from the mice's mean RDM.
 - *Worse than another mouse*: below the fit that a further mouse would exceed in nine of ten cases,
   given the spread of the present mice: a prediction bound, with Student's t.
-- *Within the margin*: above the ceiling less `MARGIN` of it, in seven of eight cases: a one-sided
+- *Within the margin*: above (1 - `MARGIN`) times the ceiling, with a confidence of 7/8: a one-sided
   test whose error includes both animals and stimuli (jackknives).
 
-`Mice.power` tries both criteria on a benchmark: it takes each mouse as a model of the others, whole
-or with a share of its geometry replaced by an unrelated one: that of another mouse, the stimuli
-relabelled and the features rotated at random.
+`Mice.power` tries both criteria on a benchmark: each mouse serves as a model of the others, intact
+or with a share of its geometry replaced by an unrelated geometry: that of another mouse, with
+stimuli relabelled and features rotated at random.
 """
 
 import math
@@ -38,8 +38,8 @@ from tactile_rt.alignment.scoring import Score
 from tactile_rt.alignment.statistics import held_out, student
 
 MARGIN = 0.65  # share of the noise ceiling
-WORSE, SURE = 10, 8  # one mouse in so many is called worse by chance, one floor in so many too high
-LOST = (0.25, 0.5)  # shares of its geometry that a damaged mouse has lost, for the power
+WORSE, SURE = 10, 8  # error rates: 1/10 of mice called worse by chance, 1/8 of floors too high
+LOST = (0.25, 0.5)  # shares of geometry that damaged mice have lost, for the power
 DRAWS = 20  # random damages for every mouse and share
 # Weight of the variance of distances by deviations alone, which grows with these, relative to that
 # along the present differences; 0.25 to 1 do about as well.
@@ -49,7 +49,7 @@ NO_FIT = -9.0  # for a layer without a fit: lower than any fit
 
 @cache
 def _make_contrasts(stimuli: int) -> Floats:
-    """Return contrasts (pair, stimulus): 1 for a pair's first stimulus, -1 for its second."""
+    """Return contrasts (pair, stimulus): 1 at a pair's first stimulus, -1 at the second."""
     i, j = upper(stimuli)
     return np.eye(stimuli)[i] - np.eye(stimuli)[j]
 
@@ -63,36 +63,36 @@ def _select_parts(stimuli: int) -> NDArray[np.bool_]:
 
 @dataclass(frozen=True, eq=False)
 class BesideMice:
-    """Fits of models to mice: correlations of RDMs, corrected for the noise of the mice."""
+    """Comparison of models with mice: correlations of RDMs, corrected for the mice's noise."""
 
     fits: Floats  # (model, mouse) fit to each mouse, of a layer that was chosen on the others
     fit: Floats  # (model,) mean fit of each model; NaN if no layer has an RDM
-    error: Floats  # (model,) standard error of fit less ceiling, over animals and stimuli
+    error: Floats  # (model,) standard error of fit minus ceiling, over animals and stimuli
     floor: Floats  # (model,) lower confidence bound of each fit, one-sided, 7/8
-    ceiling: float
-    bound: float
+    ceiling: float  # noise ceiling: mean fit of a mouse to another
+    bound: float  # fit below which a model is worse than another mouse
 
     @property
     def worse(self) -> NDArray[np.bool_]:
-        """(model,) True for models that are worse than another mouse."""
+        """Mask (model,) of models that are worse than another mouse."""
         return np.asarray(self.fit < self.bound)
 
     @property
     def within(self) -> NDArray[np.bool_]:
-        """(model,) True for models that are shown to be within the margin."""
+        """Mask (model,) of models that are within the margin with confidence."""
         return np.asarray(self.floor > (1 - MARGIN) * self.ceiling)
 
 
 @dataclass(frozen=True)
 class Power:
-    """Power of the Turing test in a benchmark, tried on its own mice."""
+    """Power of the Turing test with a benchmark, estimated from its own mice."""
 
-    passes: float  # share of whole mice that pass
+    passes: float  # share of intact mice that pass
     fails: dict[float, float]  # share of damaged mice that fail, by the share of geometry lost
 
 
 class Mice:
-    """The mice that models are compared with.
+    """The mice that models are compared with, with the noise ceiling of their fits.
 
     Args:
         rdms: (mouse, pair), finite, of three mice or more.
@@ -115,7 +115,7 @@ class Mice:
         self.bound = self.ceiling - student(number - 1, WORSE) * math.sqrt(1 + 1 / number) * spread
 
     def compare(self, models: ArrayLike) -> BesideMice:
-        """Compare models, given as RDMs (model, layer, pair); layers with NaN are left out."""
+        """Fit models to mice, given RDMs (model, layer, pair); skip layers with NaN."""
         vectors = self._normalise(np.asarray(models, dtype=np.float64))
         fits = np.einsum("pmlk,pnk->pmln", vectors, self._targets)
         finite = np.isfinite(fits).all(axis=(0, 3))[..., None]
@@ -138,7 +138,7 @@ class Mice:
         )
 
     def power(self, seed: int = 0) -> Power:
-        """Test every mouse, of four or more, whole and damaged, against the others."""
+        """Estimate power: test each mouse, intact and damaged, against three or more others."""
         rng = np.random.default_rng(seed)
         number = len(self.rdms)
         passes, fails = 0, np.zeros((len(LOST), DRAWS))
@@ -155,7 +155,7 @@ class Mice:
         return Power(passes / number, dict(zip(LOST, shares.tolist(), strict=True)))
 
     def _normalise(self, rdms: Floats) -> Floats:
-        """Weight, centre and normalise RDMs for each part: (part, ..., pair); NaN if constant."""
+        """Whiten, centre and normalise RDMs for each part: (part, ..., pair); NaN if constant."""
         values = np.tensordot(rdms, self._maps, axes=(-1, 1))  # (..., part, pair)
         length = np.sqrt((values**2).sum(axis=-1, keepdims=True))
         size = np.sqrt((rdms**2).sum(axis=-1))[..., None, None]
@@ -196,7 +196,7 @@ def _compute_gram(rdm: Floats) -> Floats:
 
 
 def _damage(rdm: Floats, strangers: Floats, lost: float, rng: np.random.Generator) -> Floats:
-    """Mix a share `lost` of strangers' geometry into an RDM; return RDMs (draw, pair)."""
+    """Replace a share `lost` of an RDM's geometry by strangers'; return RDMs (draw, pair)."""
     made = np.empty_like(strangers)
     own = _compute_features(rdm)
     stimuli = len(own)
@@ -210,7 +210,7 @@ def _damage(rdm: Floats, strangers: Floats, lost: float, rng: np.random.Generato
 
 
 def _compute_features(rdm: Floats) -> Floats:
-    """Compute features (stimulus, feature) of mean square one from an RDM."""
+    """Compute features (stimulus, feature) with mean square 1 that have a given RDM."""
     values, vectors = np.linalg.eigh(_compute_gram(rdm))
     features = vectors * np.sqrt(np.maximum(values, 0))
     return np.asarray(features / np.sqrt((features**2).mean()))
@@ -224,7 +224,7 @@ LARGEST_DROP = 0.05  # share of the noise ceiling
 
 @dataclass(frozen=True)
 class Check:
-    """The result of one test: an exit code and the reason."""
+    """The result of one test of the gate: an exit code and the reason."""
 
     name: str
     code: int
@@ -232,12 +232,12 @@ class Check:
 
     @property
     def verdict(self) -> str:
-        """The result as a word: pass, fail or inconclusive."""
+        """Result as a word: pass, fail or inconclusive."""
         return ("pass", "fail", "inconclusive")[self.code]
 
 
 def exit_code(checks: Sequence[Check]) -> int:
-    """Combine tests: fail if any fails, else inconclusive if any is inconclusive."""
+    """Combine tests' exit codes: fail if any fails, else inconclusive if any is."""
     codes = {check.code for check in checks}
     return FAIL if FAIL in codes else INCONCLUSIVE if INCONCLUSIVE in codes else PASS
 
@@ -245,10 +245,10 @@ def exit_code(checks: Sequence[Check]) -> int:
 def neural_checks(
     score: Score, benchmark: Benchmark, baseline: ArrayLike | None = None
 ) -> tuple[Check, ...]:
-    """Run tests 1 to 3; the latter two are inconclusive if the benchmark is invalid.
+    """Run the gate's neural tests; if the benchmark is invalid, later tests are inconclusive.
 
     Args:
-        baseline: (layer, pair) RDMs of the stored model's layers; None to leave out test 3.
+        baseline: (layer, pair) RDMs of the stored model's layers; None to skip the regression test.
     """
     valid = validity(benchmark)
     if valid.code != PASS:
@@ -278,10 +278,10 @@ def validity(benchmark: Benchmark) -> Check:
 
 
 def turing(score: Score, mice: Mice, power: Power | None = None) -> Check:
-    """Test a model against mice: fail if worse than another mouse, pass if near one.
+    """Run a model's Turing test: fail if worse than another mouse, pass if close.
 
-    To pass, its fit must be within the margin of the noise ceiling, and the p of its score below
-    `LARGEST_P`. A model that neither fails nor passes is inconclusive.
+    To pass, the fit must be within the margin of the noise ceiling, and the p of the score below
+    `LARGEST_P`. If the model neither fails nor passes, the test is inconclusive.
     """
     found = mice.compare(score.rdms[None])
     fit, floor, least = float(found.fit[0]), float(found.floor[0]), (1 - MARGIN) * found.ceiling
@@ -306,8 +306,8 @@ def turing(score: Score, mice: Mice, power: Power | None = None) -> Check:
 def regression(score: Score, mice: Mice, baseline: ArrayLike) -> Check:
     """Test a model's drop of fit: pass if certainly small, fail if certain and large.
 
-    The drop is that of the fit to single mice, paired; it is small below `LARGEST_DROP` of the
-    noise ceiling. Certainty is by one-sided tests over the mice, on these stimuli.
+    The drop is from the stored model's fits to single mice, paired; it is small below
+    `LARGEST_DROP` of the noise ceiling. Certainty is by one-sided tests over the mice.
 
     Args:
         baseline: (layer, pair) RDMs of the stored model's layers.

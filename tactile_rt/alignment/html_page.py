@@ -28,7 +28,7 @@ svg{max-width:100%;height:auto;display:block}summary{cursor:pointer}
 
 
 def make_page(title: str, body: str, style: str = "") -> str:
-    """Return a page with the given body, its style added to that of all pages."""
+    """Return an HTML page with a given body; `style` is CSS in addition to `STYLE`."""
     return (
         '<!doctype html><html lang="en"><head><meta charset="utf-8">'
         '<meta name="viewport" content="width=device-width">'
@@ -55,5 +55,5 @@ def format_number(value: float, digits: int = 2) -> str:
 
 
 def write_page(text: str, path: Path) -> None:
-    """Write a page, whole or not at all."""
+    """Write the text of a page to a file, atomically."""
     write_whole(path, lambda file: file.write(text.encode()))

@@ -1,4 +1,4 @@
-"""JSON files of structs, arrays as lists and NaN as null, written whole."""
+"""JSON files of structs, with arrays as lists and NaN as null, written atomically."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_origin
@@ -10,14 +10,14 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.files import check_no_pointer, write_whole
 
 T = TypeVar("T")
-LARGEST = 1e12  # largest number in a file: greater ones cannot be drawn
+LARGEST = 1e12  # largest number in a file: larger numbers cannot be plotted
 
 if TYPE_CHECKING:
     Number = float
 else:
 
     class Number(np.float64):
-        """A number that is null in the file if it is NaN."""
+        """Number that is stored as null if it is NaN."""
 
 
 def encode(value: Any) -> bytes:
@@ -26,13 +26,13 @@ def encode(value: Any) -> bytes:
 
 
 def write_json(value: Any, path: Path) -> None:
-    """Write structs as JSON, whole or not at all."""
+    """Write structs to a JSON file, atomically."""
     text = msgspec.json.format(encode(value), indent=1)
     write_whole(path, lambda out: out.write(text + b"\n"))
 
 
 def read_json(path: Path, kind: type[T], made_by: str) -> T:
-    """Read a struct, whose tag names its kind and version, from a file of `write_json`."""
+    """Read a struct from a file written by `write_json`, and check its kind and version."""
     check_no_pointer(path)
     try:
         return msgspec.json.decode(path.read_bytes(), type=kind, dec_hook=_decode_numbers)

@@ -1,4 +1,4 @@
-"""Responses of a model's layers to the stimuli, independent of where they were computed."""
+"""Responses of a model's layers to the stimuli, from any kind of model file."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-PARTS = ("encoder", "attender", "decoder")  # every layer's name begins with one of them and a dot
+PARTS = ("encoder", "attender", "decoder")  # every layer's name is PART.NAME
 SAME = 1e-6  # relative difference that rounding may cause between equal inputs of a batch
 
 
@@ -36,7 +36,7 @@ class Layers:
 
 
 def table(value: object) -> Mapping[str, object]:
-    """Return a value if it is a table, else an empty table."""
+    """Return a value if it is a dictionary, else an empty dictionary."""
     return value if isinstance(value, dict) else {}
 
 

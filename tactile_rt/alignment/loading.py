@@ -25,11 +25,10 @@ FIGURES = re.compile(r"(test_|validation_)?top1")
 
 
 def check_models(paths: Sequence[Path]) -> tuple[str, ...]:
-    """Check that all paths are models, before any is scored or torch is loaded.
+    """Check that all paths are models, without loading torch; return distinct names.
 
-    Returns:
-        A name for each: that in the file; for a training run its folder's, in a grid its task's,
-        with parent folders as needed to distinguish runs. `told_apart` makes equal names distinct.
+    A model's name is that in its file; for a training run the folder's, in a grid the task's, with
+    parent folders as needed to distinguish runs. `told_apart` makes equal names distinct.
     """
     names: list[str] = []
     runs = {path: path.resolve().parent for path in paths if path.name == BEST}
@@ -48,9 +47,9 @@ def check_models(paths: Sequence[Path]) -> tuple[str, ...]:
 
 
 def told_apart(names: Sequence[str], paths: Sequence[Path]) -> tuple[str, ...]:
-    """Make names distinct: a repeated name gets its file's path added.
+    """Make names distinct by adding the file's path to a repeated name.
 
-    The path has as many parent folders as it takes; a file that is given again gets a number.
+    The path has as many parent folders as needed; a file that is given again gets a number.
     """
     found: list[str] = []
     for k, (name, path) in enumerate(zip(names, paths, strict=True)):
@@ -98,11 +97,11 @@ def load_layers(
     input_name: str = "",
     names: tuple[str, ...] = STIMULI,
 ) -> tuple[Layers, tuple[float, str] | None]:
-    """Return a model's layers and, if known, its accuracy with the name of the metric.
+    """Load a model's layers and, if known, its accuracy with the metric's name.
 
     Args:
-        names: names of the stimuli; for others than `STIMULI`, only responses can be read.
-        input_name: the input of a foreign ONNX file that takes the loads, if it has several.
+        names: names of the stimuli; if they are not `STIMULI`, only responses can be loaded.
+        input_name: the name of the input for the loads, if a foreign ONNX file has several.
 
     Raises:
         ConfigError: the stimuli are of another array, or do not fit a foreign model's input.
@@ -134,10 +133,10 @@ def load_layers(
 
 
 def load_untrained(path: Path, stimuli: StimuliInput, seed: int) -> Layers | None:
-    """Return the layers of a model's architecture with random weights, as before training.
+    """Build a model's network with random weights; return its layers as a control.
 
-    The card in an ONNX file's metadata names its architecture. None for responses, for models made
-    elsewhere, and for a card that does not name its network.
+    For an ONNX file, the card in its metadata specifies the network. The result is None for
+    responses, for models made elsewhere, and for a card that does not specify its network.
 
     Raises:
         ConfigError: a seed below 0.
@@ -156,7 +155,7 @@ def load_untrained(path: Path, stimuli: StimuliInput, seed: int) -> Layers | Non
 
 
 def _find_accuracy(figures: object) -> tuple[float, str] | None:
-    """Return a model's top-1 accuracy, 0 to 1, and its name, from its figures."""
+    """Find a model's top-1 accuracy, 0 to 1, and its name in the model's metrics."""
     if not isinstance(figures, dict):
         return None
     for key in sorted(k for k in figures if isinstance(k, str) and FIGURES.fullmatch(k)):
@@ -167,7 +166,7 @@ def _find_accuracy(figures: object) -> tuple[float, str] | None:
 
 
 RESPONSES = ".npz"
-ORDER = "stimuli"  # array of the names of stimuli in the other arrays
+ORDER = "stimuli"  # name of the array of stimulus names
 NUMBERS = "fiu"
 LARGEST = np.finfo(np.float32).max
 
@@ -231,7 +230,7 @@ def responses_layers(path: Path, names: tuple[str, ...] = STIMULI) -> Layers:
 def _find_order(
     path: Path, archive: Mapping[str, NDArray[Any]], names: tuple[str, ...]
 ) -> NDArray[np.intp]:
-    """Return the index of each named stimulus in a file."""
+    """Return the row of each named stimulus in the arrays of a file."""
     if ORDER not in archive:
         return np.arange(len(names))
     own = archive[ORDER].astype(str).ravel().tolist()

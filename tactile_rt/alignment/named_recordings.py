@@ -32,19 +32,19 @@ Arrays = Mapping[str, NDArray[Any]]
 
 
 def has_named_stimuli(path: Path) -> bool:
-    """Return whether an archive has sessions by name, and is not in the published layout."""
+    """Return whether an ``.npz`` has named stimuli by session, not the published layout."""
     try:
         with zipfile.ZipFile(path) as archive:
             return any(name.endswith("/rates.npy") for name in archive.namelist())
     except (OSError, zipfile.BadZipFile):
-        return False  # reading it reports the error
+        return False  # the reader reports the error
 
 
 def read_named_npz(path: Path, selection: Selection | None = None) -> list[NeuralSession]:
-    """Read the sessions of an archive; its format is described in the module's docstring.
+    """Read the sessions of an ``.npz`` in the format of the module's docstring.
 
     Raises:
-        ConfigError: an array is missing or does not fit, or there are not 3 to 50 stimuli.
+        ConfigError: an array is missing or has a wrong shape, or there are not 3 to 50 stimuli.
     """
     check_no_pointer(path)
     with explain_errors(ConfigError, f"{path}: not an npz file of arrays (", most=80):
@@ -89,8 +89,8 @@ def read_spike_tables(
     Rates count from an event's start to its stop.
 
     Raises:
-        ConfigError: a missing column or an invalid value, named by its row; a session without any
-            spike within its events.
+        ConfigError: a column is missing, a value is invalid (the message names the row), or a
+            session has no spike within its events.
     """
     tables = {columns: path for path in paths if (columns := _identify_table(path))}
     if len(paths) != 2 or set(tables) != {SPIKES, EVENTS}:
@@ -125,7 +125,7 @@ def read_spike_tables(
 def _make_sessions(
     path: Path, sessions: Mapping[tuple[str, str], Arrays], selection: Selection
 ) -> list[NeuralSession]:
-    """Make sessions with one common order of stimuli, that of `STIMULI` if it fits."""
+    """Make the selected sessions, with stimuli in one order, that of `STIMULI` if possible."""
     if selection.task:
         raise ConfigError(f"{path}: has no tasks to select by")
     shown = {key: found["stimulus"].astype(str) for key, found in sessions.items()}
@@ -156,7 +156,7 @@ def _make_sessions(
 
 
 def _identify_table(path: Path) -> tuple[str, ...]:
-    """Return the columns of the table that a file holds, `SPIKES` or `EVENTS`; else ()."""
+    """Return the columns of the table in a file: `SPIKES`, `EVENTS`, or () if neither."""
     check_no_pointer(path)
     with explain_errors(ConfigError, f"{path}: cannot be read (", most=80):
         with path.open(newline="", encoding="utf-8-sig") as file:

@@ -17,19 +17,19 @@ from tactile_rt.core.stream.stimuli import STIMULI
 
 @dataclass(frozen=True, eq=False)
 class NeuralSession:
-    """One recording of one animal.
+    """One recorded session of one animal: rates and stimuli by trial.
 
     Attributes:
         rates: (trial, unit) Firing rates in spikes per second, in the order of the trials.
         stimulus: (trial,) The stimulus of each trial, as an index into `stimuli`.
         course: (trial, bin, unit) Firing rates in spikes per second in 22 bins of 45 ms, as many as
-            a model has steps, from the beginning of the window; NaN from the bin on that the choice
-            falls into. None if unknown.
+            a model has steps, from the start of the window; NaN from the bin that includes the
+            choice on. None if unknown.
         depth: (unit,) The depth of each unit below the pia in um, NaN where unknown; None if
             unknown for all units.
-        inhibitory: (unit,) Whether each unit is a putative inhibitory neuron; None if unknown.
-        begin: (trial,) The time when each trial began on the session's clock in s, which serves to
-            recognise two sortings of one recording; None if unknown.
+        inhibitory: (unit,) True for a putative inhibitory neuron; None if unknown.
+        begin: (trial,) The start time of each trial on the session's clock in s, used to recognise
+            two sortings of one recording; None if unknown.
         stimuli: The names of the stimuli.
     """
 
@@ -67,26 +67,26 @@ class NeuralSession:
 
     @property
     def trials(self) -> NDArray[np.int64]:
-        """Number of trials (stimulus,) of every stimulus."""
+        """Number of trials of every stimulus (stimulus,)."""
         return np.bincount(self.stimulus, minlength=len(self.stimuli))
 
 
 @dataclass(frozen=True)
 class Animal:
-    """An animal and its sessions, each with other units."""
+    """An animal and its recorded sessions, each with different units."""
 
     name: str
     sessions: tuple[NeuralSession, ...]
 
 
 def by_animal(sessions: Sequence[NeuralSession]) -> tuple[Animal, ...]:
-    """Group sessions by animal, animals in the order of their names."""
+    """Group sessions by animal; return the animals, sorted by name."""
     names = sorted({session.animal for session in sessions})
     return tuple(Animal(n, tuple(s for s in sessions if s.animal == n)) for n in names)
 
 
 def published_layout(animal: Animal) -> Floats:
-    """Arrange an animal's rates as the published analysis does, two mistakes included.
+    """Arrange an animal's rates as the published analysis does, with its two mistakes.
 
     - The stimulus axis follows the order in which stimuli first appear in each session, so that
       the same index means different stimuli in different sessions.
@@ -97,7 +97,7 @@ def published_layout(animal: Animal) -> Floats:
         (row, 6, unit): row k holds the k-th trial of every session, NaN after a session's last.
 
     Raises:
-        ConfigError: a session lacks a stimulus, where the published code stops.
+        ConfigError: a session lacks a stimulus, for which the published code fails as well.
     """
     blocks = []
     for session in animal.sessions:
@@ -117,7 +117,7 @@ def published_layout(animal: Animal) -> Floats:
 
 
 def pad(blocks: Sequence[Floats]) -> Floats:
-    """Join arrays (row, 6, unit) along units, the shorter ones padded with NaN."""
+    """Concatenate arrays (row, 6, unit) along units; pad shorter arrays with rows of NaN."""
     rows = max(block.shape[0] for block in blocks)
     return np.concatenate(
         [np.pad(b, ((0, rows - len(b)), (0, 0), (0, 0)), constant_values=np.nan) for b in blocks],
@@ -126,7 +126,7 @@ def pad(blocks: Sequence[Floats]) -> Floats:
 
 
 def rates_sha256(arrays: Mapping[str, NDArray[np.generic]]) -> str:
-    """Return the SHA-256 of named arrays: names, shapes, types and values."""
+    """Return the SHA-256 hash of named arrays, from names, shapes, types and values."""
     digest = hashlib.sha256()
     for name in sorted(arrays):
         array = np.ascontiguousarray(arrays[name])
@@ -137,17 +137,17 @@ def rates_sha256(arrays: Mapping[str, NDArray[np.generic]]) -> str:
 
 # The published code saved this option of `numpy.savez` as if it were an animal.
 NOT_AN_ANIMAL = "allow_pickle"
-LARGEST = 1 << 30  # bytes of an archive; the published ones have some tens of millions
+LARGEST = 1 << 30  # most bytes in an archive; the published archives have tens of millions
 
 
 def read_published(path: Path) -> dict[str, Floats]:
-    """Read every animal's rates (row, 6, unit), NaN-padded, in the published layout.
+    """Read every animal's rates (row, 6, unit), NaN-padded, from an ``.npz`` as published.
 
     The published file has an entry ``allow_pickle``, an option that was saved as if it were an
     animal: it is ignored, and nothing is ever unpickled.
 
     The stimulus axis has no names in such a file, so only protocol paper-code can use it; see
-    `neural.published_layout`.
+    `published_layout`.
     """
     check_no_pointer(path)
     try:

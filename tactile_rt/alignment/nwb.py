@@ -38,14 +38,14 @@ if TYPE_CHECKING:
 Progress = Callable[[float], None]
 
 BIN_S = 0.045
-COURSE_BINS = 22  # as many as the steps of the compared models
+COURSE_BINS = 22  # the number of steps of the compared models
 WINDOWS = ("contact", "start")  # events that begin a trial's window; it ends with the choice
 LONGEST_TRIAL_S, LONGEST_SESSION_S = 600.0, 1e6
-SILENT_S = 60.0  # trials with no spike of any unit within this time were not recorded
+SILENT_S = 60.0  # trials without any unit's spike within this time were not recorded
 
 
 class Reading(NamedTuple):
-    """A session read from a file; `response` is None without contacts or spikes."""
+    """A session read from an NWB file; its contact `response` is None if not measurable."""
 
     session: NeuralSession
     notes: list[str]
@@ -54,7 +54,7 @@ class Reading(NamedTuple):
 
 
 def find_nwb(paths: Iterable[Path]) -> list[Path]:
-    """Find NWB files in paths; in folders, those named with ``ecephys``, if any."""
+    """Find NWB files in files and folders; in a folder, prefer names with ``ecephys``."""
     found = []
     for path in paths:
         if not (path.is_dir() or path.is_file()):
@@ -120,7 +120,7 @@ def read_session(
     clock: str = "session",
     selection: Selection | None = None,
 ) -> Reading:
-    """Read the session of an NWB file; see `read_nwb`."""
+    """Read the session of one NWB file; arguments as for `read_nwb`."""
     for what, value, known in (("window", window, WINDOWS), ("clock", clock, CLOCKS)):
         if value not in known:
             raise ConfigError(f"no {what} {value!r}: there are {name_some(known, 8)}")
@@ -143,7 +143,7 @@ def _import_h5py() -> Any:
 def _assemble(
     file: "h5py.File", name: str, window: str, progress: Progress, clock: str, selection: Selection
 ) -> Reading:
-    """Assemble a session from parts of its file, and leave out bad trials and units."""
+    """Assemble a session from parts of its file, without bad trials and units."""
     notes: list[str] = []
     trials = parts.trial_columns(file)
     shapes, places = parts.text(trials["stimulus"]), parts.text(trials["servo_position"])

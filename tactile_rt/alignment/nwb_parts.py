@@ -1,7 +1,7 @@
-"""Parts of an NWB file of the barrel-cortex recordings, each checked as it is read.
+"""Readers of parts of an NWB file of the barrel-cortex recordings, with checks.
 
 An error that makes a session useless raises a `ConfigError` that names the place in the file; the
-caller adds the file. A faulty trial, contact, spike or unit is left out, with a note.
+caller adds the file's name. A faulty trial, contact, spike or unit is left out, with a note.
 """
 
 from collections import defaultdict
@@ -26,15 +26,15 @@ CONTACTS = "contacts_by_whisker_"
 WHISKER = "processed_position_whisker_"
 SUBJECT = "general/subject/subject_id"
 EXPERIMENT = "general/experiment_description"  # names the task
-LARGEST = 1 << 30  # bytes of a column; the longest ones, of spike times, have some millions
-NAMED = 5  # trials or units that a note lists at most
+LARGEST = 1 << 30  # most bytes in a column; the longest, of spike times, have some millions
+NAMED = 5  # most trials or units that a note lists
 BACK_S = 0.01  # disorder of spike times that sorters may leave; a larger step is another clock
-FAR_S = 3600.0  # spikes are far if outside the trials by more than this and than their duration
+FAR_S = 3600.0  # spikes are far if outside the trials by more than this and the trials' duration
 FAR_SHARE, SAME_SHARE = 0.01, 0.05  # of a unit's spikes; smaller shares are mistakes or chance
 
 
 def read_column(file: Any, name: str) -> NDArray[Any]:
-    """Read a column as stored; it must have one dimension and not be too large."""
+    """Read a column as stored; check that it is one-dimensional and not too large."""
     data = file[name]
     if getattr(data, "ndim", None) != 1:
         raise ConfigError(f"{name} is not a column of values")
@@ -44,7 +44,7 @@ def read_column(file: Any, name: str) -> NDArray[Any]:
 
 
 def trial_columns(file: "h5py.File") -> dict[str, NDArray[Any]]:
-    """Read the needed columns of the trials as stored; they must have one length."""
+    """Read the needed columns of the trials as stored; check that their lengths are equal."""
     if TRIALS not in file:
         raise ConfigError(f"has no {TRIALS}")
     table = file[TRIALS]
@@ -60,7 +60,7 @@ def trial_columns(file: "h5py.File") -> dict[str, NDArray[Any]]:
 
 
 def contact_times(file: "h5py.File", notes: list[str]) -> Floats:
-    """Read the sorted start times of all contacts, s; `notes` receives what is left out."""
+    """Read the sorted start times of all contacts, s; append omissions to `notes`."""
     found = {k: v for module in file.get("processing", {}).values() for k, v in module.items()}
     clocks = {name: last_time(found[name]) for name in found if name.startswith(WHISKER)}
     last = {name: end for name, end in clocks.items() if end is not None}
@@ -99,7 +99,7 @@ def last_time(clock: Any) -> float | None:
 
 
 def spike_times(file: "h5py.File", notes: list[str]) -> list[Floats]:
-    """Read each unit's finite spike times, s, in stored order; `notes` receives the others."""
+    """Read each unit's finite spike times, s, in stored order; append omissions to `notes`."""
     for name in ("units/spike_times", "units/spike_times_index"):
         if name not in file:
             raise ConfigError(f"has no {name}: is this a session with spikes?")
@@ -124,12 +124,12 @@ def spike_times(file: "h5py.File", notes: list[str]) -> list[Floats]:
 def usable_units(
     units: list[Floats], begin: float, end: float, notes: list[str]
 ) -> tuple[list[Floats], NDArray[np.bool_]]:
-    """Sort the spike times of units, and mark units that can be averaged.
+    """Sort each unit's spike times, and return them with a mask of usable units.
 
     Args:
-        units: times in s, in the order stored.
-        begin, end: beginning of the first trial and end of the last one, in s.
-        notes: receives what is left out, and why.
+        units: each unit's times in s, in stored order.
+        begin, end: start of the first trial and end of the last trial, in s.
+        notes: list to which omissions are appended, with the reason.
     """
     far, usable = max(FAR_S, end - begin), np.ones(len(units), dtype=np.bool_)
     kept, seen, faults = [], dict[bytes, int](), defaultdict[str, list[int]](list)
@@ -166,7 +166,7 @@ def usable_units(
 
 
 def mark_overlaps(start: Floats, stop: Floats) -> NDArray[np.bool_]:
-    """Mark trials on another clock, stored twice, or overlapping the next one."""
+    """Return a mask of trials on another clock, stored twice, or overlapping the next."""
     bad = np.zeros(len(start), dtype=np.bool_)
     for again in range(2):
         order = np.lexsort((stop, start, bad))[: (~bad).sum()]
@@ -185,7 +185,7 @@ def mark_overlaps(start: Floats, stop: Floats) -> NDArray[np.bool_]:
 
 
 def name_rows(rows: Sequence[int]) -> str:
-    """Format some rows of a table for a note, each once."""
+    """Format the first few distinct row numbers for a note."""
     rows = sorted(set(rows))
     return ", ".join(map(str, rows[:NAMED])) + (", ..." if len(rows) > NAMED else "")
 
@@ -193,7 +193,7 @@ def name_rows(rows: Sequence[int]) -> str:
 def unit_column(
     file: "h5py.File", name: str, units: int, notes: list[str], among: Sequence[float] = ()
 ) -> Floats | None:
-    """Read a column (unit,) as numbers, all in `among` if given; None if unusable."""
+    """Read a numeric column of the units; None if missing or not all in `among`."""
     if name not in file.get("units", {}):
         return None
     values = read_column(file["units"], name)
@@ -221,14 +221,14 @@ def starting_time(file: "h5py.File") -> float | None:
 
 
 def animal_name(file: "h5py.File", stem: str) -> str:
-    """Return the subject; if missing, the first part of the file's name, as published."""
+    """Return the subject's name or, as published, the first part of the file's name."""
     if SUBJECT in file:
         return _read_text(file, SUBJECT)
     return stem.partition("_")[0].removeprefix("sub-")
 
 
 def task_of(file: "h5py.File", shown: NDArray[np.str_]) -> str:
-    """Return the mouse's task as the file names it, else by trials without a shape."""
+    """Return the mouse's task: named in the file, or inferred from trials without a shape."""
     if EXPERIMENT in file:
         named = [task for task in TASKS if task in _read_text(file, EXPERIMENT)]
         if len(named) == 1:
@@ -247,14 +247,14 @@ def text(column: NDArray[Any]) -> NDArray[np.str_]:
 
 
 def flags(column: NDArray[Any], what: str) -> NDArray[np.int64]:
-    """Convert a column of truth values of any type to 1, 0, or -1 (neither)."""
+    """Convert truth values of any type to 1 (true), 0 (false) or -1 (neither)."""
     if column.dtype.kind not in "biu":
         raise ConfigError(f"{TRIALS} column {what} is {column.dtype}, not true or false")
     return np.where(np.isin(column, (0, 1)), column, -1).astype(np.int64)
 
 
 def numbers(values: NDArray[Any], what: str) -> Floats:
-    """Convert times in seconds to floats; `what` names them in an error."""
+    """Convert a column of times in seconds to floats; `what` names it in an error."""
     if values.dtype.kind not in "fiu":
         raise ConfigError(f"{what} is {values.dtype}, not times in seconds")
     return values.astype(np.float64)

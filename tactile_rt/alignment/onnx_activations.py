@@ -1,8 +1,8 @@
-"""Activations of every layer of an ONNX file, for the six stimuli.
+"""Activations of every layer of an ONNX file in response to the six stimuli.
 
-Layers become further outputs of a copy of the graph in memory. The file does not change, and its
-logits should stay the same bitwise: `onnx_layers` runs both and notes a difference. A step file is
-run for each of the 22 steps of a stimulus; a window, which is a `Scan` over the same step, once.
+Layers become further outputs of a copy of the graph in memory. The logits of the copy should be
+bitwise the same: `onnx_layers` runs both and notes a difference. A step file is run for each of the
+22 steps of a stimulus; a window file, which is a `Scan` over the same step, once.
 
 Layers are found by the names of their parameters. Where the exporter folds weights, it keeps the
 names of biases and norms (``model.network.attender.norm.bias``), and quantisation keeps these and
@@ -62,7 +62,7 @@ RULES = tuple(
 
 
 def step_graph(model: onnx.ModelProto) -> tuple[onnx.GraphProto, onnx.NodeProto | None]:
-    """Return the graph of one step, and a window file's `Scan` that runs it."""
+    """Return the graph of one step and, in a window file, its `Scan` node."""
     for node in model.graph.node:
         if node.op_type == "Scan":
             return next(a.g for a in node.attribute if a.name == "body"), node
@@ -70,7 +70,7 @@ def step_graph(model: onnx.ModelProto) -> tuple[onnx.GraphProto, onnx.NodeProto 
 
 
 def named_taps(model: onnx.ModelProto) -> dict[str, str]:
-    """Find tensors by layer, in order of computation; layers without names are missing."""
+    """Find each layer's tensor, in the order of computation; skip layers without named weights."""
     graph, _ = step_graph(model)
     readers: dict[str, list[onnx.NodeProto]] = {}
     for node in graph.node:
@@ -78,8 +78,8 @@ def named_taps(model: onnx.ModelProto) -> dict[str, str]:
             readers.setdefault(source, []).append(node)
     place = {o: i for i, node in enumerate(graph.node) for o in node.output}
     # The node of a module is the last that reads one of its parameters: a sum after a product.
-    # The exporter merges equal parameters, as of an untrained network, under the name of any of
-    # them: a parameter that several nodes read identifies no module.
+    # The exporter merges equal parameters, as in an untrained network, under one of their names:
+    # a parameter that several nodes read identifies no module.
     modules: dict[str, onnx.NodeProto] = {}
     for initializer in (*model.graph.initializer, *graph.initializer):
         match = PARAMETER.match(initializer.name)
@@ -109,7 +109,7 @@ def named_taps(model: onnx.ModelProto) -> dict[str, str]:
                 for layer, tensor in _find_tensors(name, number, where, node, readers):
                     taps.setdefault(layer, tensor)
     if "attender.norm" in taps and "attender.block7" in taps:
-        # The last layer of a GPT has no bias that would keep its name.
+        # The last layer of a GPT has no bias to keep its name.
         if product := _find_reader(taps["attender.norm"], readers, "MatMul"):
             taps.setdefault("attender.project_out", product.output[0])
     part = PARTS.index
@@ -119,7 +119,7 @@ def named_taps(model: onnx.ModelProto) -> dict[str, str]:
 
 
 def precision_of(model: onnx.ModelProto) -> str:
-    """Return ``int8``, ``fp16``, ``bf16`` or ``fp32``, by the graph's operators and weights."""
+    """Return a model's precision by its operators and weights: int8, fp16, bf16 or fp32."""
     graph, _ = step_graph(model)
     if QUANTISED.intersection(node.op_type for node in graph.node):
         return "int8"
@@ -136,7 +136,7 @@ def _find_tensors(
     node: onnx.NodeProto,
     readers: dict[str, list[onnx.NodeProto]],
 ) -> Iterable[tuple[str, str]]:
-    """Yield a rule's layers and their tensors, from the node that reads the parameter."""
+    """Yield the layers and tensors of a rule, given the node that reads the parameter."""
     out = node.output[0]
     if where == "input":
         yield f"{name.removesuffix('{-1}')}{int(number) - 1}", node.input[0]
@@ -144,7 +144,7 @@ def _find_tensors(
         before, after = name.split()
         yield from ((before, node.input[0]), (after, out))
     elif where == "sum":
-        # After a product whose bias has lost its name, the next sum adds that bias.
+        # After a product whose bias has lost its name, the next sum only adds that bias.
         total = None if node.op_type == "MatMul" else _find_reader(out, readers, "Add")
         if total is not None:
             yield name.format(number), _follow_activation(total.output[0], readers)
@@ -165,7 +165,7 @@ def _find_reader(
 
 
 def _follow_activation(tensor: str, readers: dict[str, list[onnx.NodeProto]]) -> str:
-    """Return the output of the ReLU that follows, directly or after a cell's few sums."""
+    """Return the output of the ReLU that follows a tensor, or the tensor itself."""
     at = tensor
     for _ in range(4):
         if (node := _find_reader(at, readers, "Relu")) is not None:
@@ -177,13 +177,13 @@ def _follow_activation(tensor: str, readers: dict[str, list[onnx.NodeProto]]) ->
 
 
 Floats = NDArray[np.float32]
-TOKENS = 2  # of a GPT attender's step, the action token last
-REASON = 120  # characters of an onnxruntime message
+TOKENS = 2  # tokens per step of a GPT attender, the action token last
+REASON = 120  # most characters of a quoted onnxruntime message
 TAP = "tap:"  # prefix of the added outputs
 
 
 def onnx_layers(path: Path, stimuli: StimuliInput) -> tuple[Layers, ModelCard]:
-    """Read the layers of a step or window file, and its card."""
+    """Run a step or window file on the stimuli; return its layers and its card."""
     with explain_errors(ModelError, f"{path}: its layers cannot be read (", most=REASON):
         plain, card, model = _open_model(path, stimuli)
         taps = named_taps(model)
@@ -216,13 +216,13 @@ def onnx_layers(path: Path, stimuli: StimuliInput) -> tuple[Layers, ModelCard]:
 
 
 def with_outputs(model: onnx.ModelProto, tensors: Iterable[str]) -> onnx.ModelProto:
-    """Return a copy with tensors as further outputs ``tap:NAME``; of a window for every step."""
+    """Return a copy of a model with tensors as further outputs ``tap:NAME``, for every step."""
     copy = onnx.ModelProto()
     copy.CopyFrom(model)
     graph, scan = step_graph(copy)
     known = {v.name: v.type for v in (*graph.value_info, *graph.output)}
     for name in tensors:
-        # Through an extra node, since a tensor that is an output already may not be one again.
+        # Through an extra node, since a tensor cannot be an output twice.
         graph.node.append(onnx.helper.make_node("Identity", [name], [f"{TAP}{name}"]))
         # The runtime infers a missing type, as for the tensors of a quantised graph.
         graph.output.append(onnx.ValueInfoProto(name=f"{TAP}{name}", type=known.get(name)))
@@ -246,7 +246,7 @@ def _open_model(
 
 
 def _make_session(model: onnx.ModelProto) -> ort.InferenceSession:
-    """Make a session with the options of `load_model`, so that it computes the same."""
+    """Make a session with the options of `load_model`, so that results are the same."""
     options = ort.SessionOptions()
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     options.add_session_config_entry("session.set_denormal_as_zero", "1")
@@ -302,7 +302,7 @@ def _run_stimuli(
 def _randomise_loads(stimuli: StimuliInput) -> StimuliInput:
     """Return random loads in the stimuli's range, which differ from the first step on.
 
-    Stimuli may begin alike, but the steps that input can reach depend on the network alone.
+    They reveal the first step that input reaches in each layer, even if stimuli begin alike.
     """
     highest = np.abs(stimuli.samples).max(axis=(0, 1, 2))
     drawn = np.random.default_rng(0).uniform(-1, 1, stimuli.samples.shape)
@@ -322,9 +322,9 @@ def _collect_traces(taps: Mapping[str, str], found: Mapping[str, Floats]) -> dic
 
 
 def _reshape_trace(layer: str, values: Floats) -> Floats:
-    """Reshape a tensor (stimulus, step, 1, ...) to (stimulus, step, unit).
+    """Reshape a layer's tensor (stimulus, step, 1, ...) to a trace (stimulus, step, unit).
 
-    Of a GPT's tokens it keeps the action token; the exporter may have merged batch and token axes.
+    Of a GPT's tokens only the action token stays; the exporter may merge batch and token axes.
     """
     if layer.startswith("attender."):
         rows = values.reshape(*values.shape[:2], -1, values.shape[-1])

@@ -1,7 +1,7 @@
-"""Layers of foreign models: an ONNX file, or a torch module by its name.
+"""Layers of foreign models: ONNX files without our model card, and torch modules by name.
 
 A layer is the output of a node with weights, after the bias and the activation that follow. The
-loads of the six stimuli are given in SI units, resampled in time if an input has another length.
+input is the loads of the six stimuli in SI units, resampled in time if the model's length differs.
 """
 
 import hashlib
@@ -30,24 +30,25 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float32]
 TYPES = {"tensor(float)": np.float32, "tensor(double)": np.float64, "tensor(float16)": np.float16}
-# Operators that pass weights on; that are layers without weights of their own; that end a layer.
+# Operators that only convert weights; that are whole layers; that belong to the layer before.
 PASSING = {"Cast", "DequantizeLinear", "Identity", "Reshape", "Squeeze", "Transpose", "Unsqueeze"}
 WHOLE = {"If", "Loop", "Scan"}
 BEHIND = {"Add", "BatchNormalization", "Clip", "Elu", "Gelu", "HardSigmoid", "HardSwish",
           "LeakyRelu", "Mish", "PRelu", "Relu", "Selu", "Sigmoid", "Softplus", "Tanh"}  # fmt: skip
 NUMBERED = re.compile(r"onnx::.*|val_\d+|\d+")  # names that an exporter generates
 OTHERWISE = "compute its responses yourself, an .npz of (6, unit) by layer"
-REASON = 80  # characters of other software's messages
+REASON = 80  # most characters of a quoted message of other software
 
 
 def other_onnx_layers(path: Path, stimuli: StimuliInput, input_name: str = "") -> Layers:
     """Run a foreign ONNX file on the six stimuli and return its layers.
 
     Args:
-        input_name: the input that takes the loads; empty if the file has only one.
+        input_name: the name of the input for the loads; empty if the file has only one input.
 
     Raises:
-        ConfigError: no such input, several inputs and none named, or loads that do not fit.
+        ConfigError: there is no such input, no input is named among several, or the loads do not
+            fit its shape.
         ModelError: the file cannot be read or run.
     """
     data = path.read_bytes()
@@ -101,7 +102,7 @@ def module_layers(reference: str, stimuli: StimuliInput) -> Layers:
             takes loads (1, sample, element, channel) float32, N and N m, every 9 ms.
 
     Raises:
-        ConfigError: no such function, or it returns no torch module.
+        ConfigError: the function does not exist, or returns no torch module.
         ModelError: the module cannot be made or run.
     """
     import torch
@@ -139,15 +140,13 @@ def module_layers(reference: str, stimuli: StimuliInput) -> Layers:
 
 
 def fit_loads(stimuli: StimuliInput, shape: Sequence[int | str | None], what: str) -> Floats:
-    """Arrange the loads for an input, resampled in time if its length differs.
+    """Arrange the loads (6, ...) in an input's shape, resampled to its time axis.
 
     Args:
-        shape: of the input, batch first; axes of any length are no numbers. The others are time,
-            elements and channels in any order, or time and one of both, or one of all three.
-        what: the file and the input, for the message.
-
-    Returns:
-        (6, ...) float32.
+        shape: the input's shape, batch first; an axis of any length is not a number. The other axes
+            are time, elements and channels in any order; or time, and the last two flattened; or
+            all three flattened.
+        what: the file and the input, for error messages.
 
     Raises:
         ConfigError: the shape has other axes, or a batch larger than 1.
@@ -186,7 +185,7 @@ def _make_zeros(path: Path, given: ort.NodeArg) -> NDArray[Any]:
 
 
 def _resample(values: Floats, length: int) -> Floats:
-    """Interpolate (6, sample, ...) linearly to another number of samples over the same time."""
+    """Interpolate (6, sample, ...) linearly to `length` samples over the same time."""
     if length == values.shape[1]:
         return values
     at = np.clip((np.arange(length) + 0.5) * values.shape[1] / length - 0.5, 0, values.shape[1] - 1)
@@ -196,7 +195,7 @@ def _resample(values: Floats, length: int) -> Floats:
 
 
 def _find_layers(graph: onnx.GraphProto) -> dict[str, str]:
-    """Find the tensors that are layers, by layer name, in the order of computation."""
+    """Find the output tensor of each layer, by layer name, in the order of computation."""
     weights = {i.name: i.name for i in graph.initializer if len(i.dims) > 1}
     readers: dict[str, list[onnx.NodeProto]] = {}
     for node in graph.node:
@@ -219,7 +218,7 @@ def _find_layers(graph: onnx.GraphProto) -> dict[str, str]:
 
 
 def _name_layer(weight: str, node: onnx.NodeProto, taken: Collection[str]) -> str:
-    """Name a layer by its weight, or its node if that name is a number."""
+    """Name a layer after its weight or, if that name is generated, after its node."""
     name = weight if weight and not NUMBERED.fullmatch(weight) else node.name.rpartition("/")[0]
     name = re.sub(r"\.?(weight\w*|kernel|W)$", "", name.strip("/").replace("/", "."))
     name = f"encoder.{name or node.op_type.lower()}"
@@ -236,7 +235,7 @@ def _find_weighted_modules(network: "nn.Module") -> Iterator[tuple[str, "nn.Modu
 def _make_layers(
     name: str, found: dict[str, list[NDArray[Any]]], samples: int, parameters: int, sha256: str
 ) -> Layers:
-    """Make layers from the outputs of each layer, one array per stimulus."""
+    """Make `Layers` from the outputs of each layer, one array per stimulus."""
     traces = {}
     for layer, values in found.items():
         trace = np.stack([_arrange_by_step(value, samples) for value in values]).astype(np.float32)
@@ -254,7 +253,7 @@ def _make_layers(
 
 
 def _arrange_by_step(value: NDArray[Any], samples: int) -> NDArray[Any]:
-    """Arrange a layer's output as (step, unit), by samples if any, else one step."""
+    """Reshape a layer's output to (step, unit), with one step per sample if possible."""
     if value.ndim > 2 and value.shape[:2] in ((1, samples), (samples, 1)):
         return value.reshape(samples, -1)
     return value.reshape(1, -1)

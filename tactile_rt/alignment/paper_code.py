@@ -1,12 +1,12 @@
-"""Protocol `paper-code`: the analysis of the published code, mistakes included.
+"""Protocol `paper-code`: the analysis of the published code, including its mistakes.
 
-It exists so that published numbers can be checked. It differs from the paper's text as follows:
+It serves to check published numbers. It differs from the paper's text as follows:
 
 - rates count from the start of a trial, not from first contact (`nwb.read_nwb`);
 - the recording's starting time is subtracted from spike times, though NWB has them on the session's
   clock already: the published shift (clock ``recording`` of `nwb.read_nwb`);
 - the stimulus axis is the order of first appearance in each session (`neural.published_layout`);
-- a stimulus that a trial did not show counts as a rate of zero (same place);
+- a stimulus that a trial did not show counts as a rate of zero (`neural.published_layout`);
 - no neuron is filtered; bootstraps are, by raw r_yy and r_xx >= 0.5 (`reliability.filtered_mean`);
 - the numerator is the RSA of full trial means, not of half 1 against half 2;
 - two negative reliabilities pass for a positive product (`reliability.noise_corrected`);
@@ -16,7 +16,7 @@ It exists so that published numbers can be checked. It differs from the paper's 
   mean with it;
 - standard errors use the standard deviation with division by the number of values, not by one less.
 
-Where the published code fails an assertion (a stimulus without a trial), this one names the cause.
+Where the published code fails an assertion (a stimulus without a trial), this code names the cause.
 """
 
 from collections.abc import Callable, Mapping
@@ -39,13 +39,13 @@ def freeze_paper_code(
     seed: int = reliability.SEED,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Benchmark:
-    """Compute reliabilities and RDMs of animals, and their consistency.
+    """Compute the benchmark of protocol paper-code from rates.
 
     Args:
         rates: (row, 6, unit) per animal, in the published layout.
 
     Raises:
-        ConfigError: no animal has an RDM; if only some have none, they are left out with a note.
+        ConfigError: no animal has an RDM. Single animals without RDM are left out, with a note.
     """
     steps = 2 * len(rates) + 1
     targets: list[Target] = []
@@ -94,7 +94,7 @@ def freeze_paper_code(
 def _freeze_target(
     name: str, rates: Floats, bootstraps: int, seed: int, halves: dict[str, Floats]
 ) -> Target:
-    """Freeze one target, and store its split-half correlations in `halves`."""
+    """Compute one target's RDM and factor; store its split-half correlations in `halves`."""
     mean = reliability.trial_mean(rates)
     dissimilarities = rdm(mean)
     if not np.isfinite(dissimilarities).all():

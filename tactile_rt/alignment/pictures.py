@@ -1,4 +1,4 @@
-"""Figures of the report, drawn by matplotlib as SVG."""
+"""Plots of the report, drawn by matplotlib as SVG."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ MAPS_A_ROW = 4
 
 @dataclass(frozen=True)
 class Bar:
-    """A bar with dots, a mark and a frame; hatched if its value is NaN."""
+    """A bar of a plot. It has dots, a mark and a frame, and is hatched if its value is NaN."""
 
     name: str
     value: float
@@ -35,7 +35,7 @@ class Bar:
 
 @dataclass(frozen=True)
 class Level:
-    """A horizontal line, with a band of `half` to both sides if above 0."""
+    """A horizontal line of a bar plot. If `half` is above 0, it has a band of that half-width."""
 
     name: str
     value: float
@@ -46,7 +46,7 @@ class Level:
 
 @dataclass(frozen=True)
 class Point:
-    """A model in a scatter plot; those of one `group` share a colour and line."""
+    """A model in a scatter plot; points of a `group` share colour and line."""
 
     name: str
     x: float
@@ -56,7 +56,7 @@ class Point:
 
 
 def draw_bars(columns: Sequence[Bar], levels: Sequence[Level], title: str) -> str:
-    """Draw bars side by side, with lines and bands that are named in the legend."""
+    """Draw bars side by side, with horizontal lines and bands; return SVG."""
     figure, axes = _start_figure(9.5, 4.6)
     for level in levels:
         if not isfinite(level.value):
@@ -71,7 +71,7 @@ def draw_bars(columns: Sequence[Bar], levels: Sequence[Level], title: str) -> st
             axes.bar(k, bar.value, 0.7, color=colour, edgecolor=INK, linewidth=2 * bar.ring)
         else:
             axes.axvspan(k - 0.35, k + 0.35, facecolor=MISSING, hatch="//", edgecolor="white")
-        # Without random jitter, so that an animal keeps its place from bar to bar.
+        # Without random jitter, so that an animal has the same place in every bar.
         places = k + 0.5 * ((np.arange(len(bar.dots)) + 0.5) / max(len(bar.dots), 1) - 0.5)
         axes.plot(places, bar.dots, "o", color="white", markeredgecolor=INK, markersize=4)
         if isfinite(bar.mark):
@@ -86,7 +86,7 @@ def draw_bars(columns: Sequence[Bar], levels: Sequence[Level], title: str) -> st
 
 
 def draw_scatter(points: Sequence[Point], x_title: str, y_title: str, log: bool = False) -> str:
-    """Draw named models, and a least-squares line for each group of three or more."""
+    """Draw models as named points, with a least-squares line per group; return SVG."""
     figure, axes = _start_figure(7.2, 4.2)
     for group in dict.fromkeys(p.group for p in points):
         of = [p for p in points if p.group == group]
@@ -119,10 +119,10 @@ def draw_scatter(points: Sequence[Point], x_title: str, y_title: str, log: bool 
 
 
 def draw_profiles(series: Sequence[tuple[str, Floats]], names: Sequence[str]) -> str:
-    """Draw RDMs (pair,) as lines over the pairs of stimuli, scaled to spread 1.
+    """Draw RDMs (pair,) as lines over the pairs of stimuli; return SVG.
 
-    The correlation of two RDMs is that of their lines as drawn. An RDM that is constant or has a
-    NaN gets no line. The first series is the one that the others are compared with.
+    RDMs are scaled to standard deviation 1, so the correlation of two RDMs is that of their lines.
+    An RDM that is constant or has a NaN gets no line. The first RDM is drawn as the reference.
     """
     figure, axes = _start_figure(9.5, 5.2)
     for k, (name, values) in enumerate(series):
@@ -139,7 +139,7 @@ def draw_profiles(series: Sequence[tuple[str, Floats]], names: Sequence[str]) ->
 
 
 def draw_heat_maps(maps: Sequence[tuple[str, Floats]], names: Sequence[str]) -> str:
-    """Draw RDMs (pair,), each darkest where it is largest; plain grey with any NaN."""
+    """Draw RDMs (pair,) as heat maps, grey if an entry is NaN; return SVG."""
     rows = ceil(len(maps) / MAPS_A_ROW)
     figure = Figure(figsize=(9.5, 2.2 * rows + 0.9), layout="constrained")
     panels = figure.subplots(rows, MAPS_A_ROW, squeeze=False)
@@ -170,12 +170,12 @@ def _start_figure(width: float, height: float) -> tuple[Figure, Axes]:
 
 
 def _escape(text: str) -> str:
-    """Escape the dollar signs of a text, which matplotlib takes for mathematics."""
+    """Escape the dollar signs of a text, which matplotlib would read as mathematics."""
     return text.replace("$", r"\$")
 
 
 def _finish_figure(figure: Figure) -> str:
-    """Return a figure as an SVG element, the same bytes for the same figure."""
+    """Convert a figure to an SVG element; equal figures give equal text."""
     out = StringIO()
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": "tactile_rt"}):
         figure.savefig(out, format="svg", transparent=True, metadata={"Date": None})

@@ -17,16 +17,16 @@ from tactile_rt.core.stream.stimuli import DISTANCES, SHAPES
 
 Floats = NDArray[np.float64]
 
-# The paper's name of a distance, and that of the recordings.
+# The paper's name of a distance: the recordings' name.
 SYNONYMS = {"near": "close"}
-# Vectors whose centred values are below this share of the values are constant, but for rounding.
+# A vector counts as constant if its centred norm is below this share of its norm: rounding errors.
 CONSTANT = 1e-13
-EXACT = 7  # stimuli for which all relabellings are used, at most
+EXACT = 7  # most stimuli for which all relabellings are used
 DRAWN = 5000  # relabellings that are drawn for more stimuli
 
 
 def stimulus_index(shape: str, distance: str) -> int:
-    """Return the index of a stimulus in `STIMULI`; ``near`` is ``close``."""
+    """Return the index in `STIMULI` of a shape at a distance; "near" means "close"."""
     distance = SYNONYMS.get(distance, distance)
     if shape not in SHAPES:
         raise ConfigError(f"no shape {shape!r}: there are {', '.join(SHAPES)}")
@@ -37,7 +37,7 @@ def stimulus_index(shape: str, distance: str) -> int:
 
 @cache
 def upper(stimuli: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return rows and columns of the entries above the diagonal, for a number of stimuli."""
+    """Return rows and columns of the entries above the diagonal of an RDM."""
     return np.triu_indices(stimuli, k=1)
 
 
@@ -47,13 +47,13 @@ def count_stimuli(entries: int) -> int:
 
 
 def rdm(patterns: ArrayLike) -> Floats:
-    """Compute the RDM of responses.
+    """Compute the RDM (..., pair) of responses.
 
     Args:
-        patterns: (..., stimulus, unit), any finite scale; at least two units.
+        patterns: (..., stimulus, unit), at any scale; at least two units.
 
     Returns:
-        (..., pair). NaN where one of the two responses is not finite or the same in all units.
+        1 - r by pair; NaN where one of the two responses is not finite or the same in all units.
     """
     unit_length = normalise_vectors(patterns)
     correlation = np.matmul(unit_length, np.swapaxes(unit_length, -1, -2))
@@ -76,7 +76,7 @@ def rsa(a: ArrayLike, b: ArrayLike) -> float:
 
 
 def square(rdms: ArrayLike) -> Floats:
-    """Arrange RDMs (..., pair) as symmetric matrices, their diagonal zero."""
+    """Convert RDMs (..., pair) to symmetric matrices (..., n, n) with a zero diagonal."""
     entries = np.asarray(rdms, dtype=np.float64)
     stimuli = count_stimuli(entries.shape[-1])
     i, j = upper(stimuli)
@@ -87,7 +87,7 @@ def square(rdms: ArrayLike) -> Floats:
 
 @cache
 def relabellings(stimuli: int) -> NDArray[np.intp]:
-    """Return all relabellings of stimuli, as reorderings of an RDM's entries.
+    """Return all relabellings of stimuli, as permutations of an RDM's entries.
 
     For more than `EXACT` stimuli, it returns a fixed random sample of `DRAWN`.
 
@@ -109,7 +109,7 @@ def relabellings(stimuli: int) -> NDArray[np.intp]:
 
 
 def normalise_vectors(values: ArrayLike) -> Floats:
-    """Centre vectors (..., n) and scale them to length one: products are Pearson's r.
+    """Centre vectors (..., n) and scale them to length 1, so products are Pearson's r.
 
     Returns:
         (..., n), NaN throughout a vector that is constant or not finite.

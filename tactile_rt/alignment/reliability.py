@@ -15,14 +15,14 @@ from tactile_rt.alignment.rdm import Floats, pearson, rdm, upper
 from tactile_rt.core.errors import ConfigError
 
 BOOTSTRAPS = 1000
-SEED = 1234  # of the first bootstrap in the published analysis
+SEED = 1234  # seed of the first bootstrap in the published analysis
 CUTOFF = 0.5
-NOUGHT = 1e-8  # a product of reliabilities up to this is zero: the score would be rounding error
+NOUGHT = 1e-8  # a product of reliabilities up to this counts as 0: scores would be rounding error
 AT_ONCE = 64  # bootstraps per batch: their half-means fit a processor's cache
 
 
 def spearman_brown(r: ArrayLike) -> Floats:
-    """Return the reliability for twice the trials: 2r / (1 + r), -inf for -1."""
+    """Return the Spearman-Brown reliability 2r / (1 + r) of a split-half r. It is -inf for -1."""
     r = np.asarray(r, dtype=np.float64)
     with np.errstate(divide="ignore"):
         return np.asarray(2 * r / (1 + r))
@@ -48,7 +48,7 @@ def first_halves(rows: int, bootstraps: int = BOOTSTRAPS, seed: int = SEED) -> N
     """Draw the rows of the first half for every bootstrap, as in the published analysis.
 
     Bootstrap b shuffles the rows with the Mersenne twister of seed ``seed + b``; the first
-    ``rows // 2`` make the first half. Padding rows count too.
+    ``rows // 2`` are the first half. Padding rows count too.
 
     Returns:
         (bootstrap, row), True for rows in the first half; read-only.
@@ -63,21 +63,20 @@ def first_halves(rows: int, bootstraps: int = BOOTSTRAPS, seed: int = SEED) -> N
 
 
 def trial_mean(rates: ArrayLike) -> Floats:
-    """Average the finite rates of (row, 6, unit) over rows; NaN without any."""
+    """Average rates (row, 6, unit) over finite rows; return (6, unit), NaN without any."""
     rates = np.asarray(rates, dtype=np.float64)
     finite = np.isfinite(rates)
     return _divide_by_count(np.where(finite, rates, 0).sum(axis=0), finite.sum(axis=0))
 
 
 def half_rdms(rates: ArrayLike, first: NDArray[np.bool_]) -> Floats:
-    """Compute the RDMs of the two half-means of every bootstrap.
+    """Compute the RDMs (bootstrap, 2, pair) of the two half-means of every bootstrap.
+
+    A bootstrap is all NaN if any of its half-means is not finite.
 
     Args:
         rates: (row, 6, unit), NaN for missing values.
         first: (bootstrap, row), True for rows in the first half.
-
-    Returns:
-        (bootstrap, 2, pair). A bootstrap is all NaN if any of its half-means is not finite.
     """
     rates = np.asarray(rates, dtype=np.float64)
     if rates.ndim != 3 or first.ndim != 2 or rates.shape[0] != first.shape[1]:
@@ -103,23 +102,20 @@ def half_rdms(rates: ArrayLike, first: NDArray[np.bool_]) -> Floats:
 
 
 def split_half(rates: ArrayLike, first: NDArray[np.bool_]) -> Floats:
-    """Correlate the RDMs of the halves: (bootstrap,); NaN where a half-mean is not finite."""
+    """Return the correlation (bootstrap,) of the halves' RDMs; NaN if a half-mean is not finite."""
     halves = half_rdms(rates, first)
     return pearson(halves[:, 0], halves[:, 1])
 
 
 def filtered_mean(score: ArrayLike, r_yy: ArrayLike, r_xx: ArrayLike = 1.0) -> float:
-    """Average a score over the bootstraps that pass the published filter.
+    """Average a score over the bootstraps that pass the published filter; NaN without any.
 
-    The filter keeps bootstraps by their raw split-half correlations, at `CUTOFF`. It filters no
-    neurons and makes no Spearman-Brown correction, though the paper's text states both.
+    The filter keeps bootstraps whose raw split-half correlations reach `CUTOFF`. It filters no
+    neurons and applies no Spearman-Brown correction, though the paper's text states both.
 
     Args:
         score: (bootstrap,), NaN if missing.
-        r_yy, r_xx: (bootstrap,) of target and source; a model's own is 1.
-
-    Returns:
-        The mean; NaN if no bootstrap is left.
+        r_yy, r_xx: (bootstrap,) split-half correlations of target and source; 1 for a model.
     """
     score, r_yy, r_xx = np.broadcast_arrays(score, r_yy, r_xx)
     # As published, NaN is not below the cutoff; its score is NaN as well.

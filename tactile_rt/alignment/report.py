@@ -1,4 +1,4 @@
-"""The report of models' scores as one HTML page."""
+"""Formatting of models' scores as one HTML page."""
 
 import math
 from collections.abc import Sequence
@@ -50,7 +50,7 @@ PERFORMANCE, SIZE, SCORE = "task performance", "parameters", "score ± s.e.m."
 
 
 def report_page(results: Results) -> str:
-    """Show scores as HTML."""
+    """Format scores as an HTML report; return its text."""
     stimuli = len(results.benchmark.stimuli)
     ways = relabellings(stimuli)
     limits = LIMITS.format(stimuli, ways.shape[1], len(ways), LIMITS_OF_SIX if results.raw else "")
@@ -174,7 +174,7 @@ def _make_point(model: ModelResult, x: float, by: str) -> pictures.Point:
 
 
 def _compare_masking(results: Results) -> str:
-    """Show a table of models that differ only in the masking of steps."""
+    """Format an HTML table of models that differ only in the masking of steps."""
     families: dict[tuple[tuple[str, str], ...], list[tuple[float, ModelResult]]] = {}
     for model in results.models:
         try:
@@ -252,7 +252,7 @@ def _show_animals(results: Results) -> str:
 
 
 def _levels(results: Results) -> list[pictures.Level]:
-    """Make a bar plot's lines and bands: the noise limit and animal to animal."""
+    """Make the lines and bands of a bar plot: noise limit and consistency between animals."""
     a2a = results.benchmark.a2a
     half = a2a.sem if math.isfinite(a2a.sem) else 0.0
     return [
@@ -262,7 +262,7 @@ def _levels(results: Results) -> list[pictures.Level]:
 
 
 def _raw_bars(results: Results) -> list[pictures.Bar]:
-    """Make the bar of the raw sensor input, if the results have it."""
+    """Make the bar of the raw sensor input; an empty list without a score."""
     if (raw := results.raw) is None:
         return []
     fits = raw.corrected[0][list(raw.reliable)]

@@ -1,4 +1,4 @@
-"""Stored scores: a JSON file for the report, and a baseline for the gate."""
+"""Scores of models stored in a JSON file, for the report and as a baseline for the gate."""
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -20,7 +20,7 @@ from tactile_rt.core.stream.stimuli import STIMULI
 
 
 class ModelResult(Score, frozen=True, eq=False, kw_only=True):
-    """All results that are shown for a model: its score, and fields as in `layers.Layers`."""
+    """All stored results of a model: its score, and fields as in `layers.Layers`."""
 
     name: str
     sha256: str
@@ -32,8 +32,8 @@ class ModelResult(Score, frozen=True, eq=False, kw_only=True):
     performance_of: str = ""
     untrained: Score | None = None
     notes: tuple[str, ...] = ()
-    # groups of the model by their criterion: encoder, attender, objective, augmentation, masking;
-    # without unknown ones
+    # the model's encoder, attender, objective, augmentation and masking, as far as they are known;
+    # the report groups models by them
     groups: dict[str, str] = msgspec.field(default_factory=dict)
     # verdict of the gate's NeuroAI Turing test: pass, fail or inconclusive; empty under paper-code
     turing: str = ""
@@ -43,7 +43,7 @@ class ModelResult(Score, frozen=True, eq=False, kw_only=True):
 class Results(
     msgspec.Struct, frozen=True, eq=False, tag_field="kind", tag="tactile_rt alignment scores 2"
 ):
-    """The content of a file of scores."""
+    """The content of a file of scores: a benchmark, and models' results on it."""
 
     benchmark: Benchmark
     models: tuple[ModelResult, ...]
@@ -54,7 +54,7 @@ class Results(
 def results_of(
     benchmark: Benchmark, stimuli: StimuliInput, models: Sequence[ModelResult]
 ) -> Results:
-    """Collect models' scores on a benchmark, with the score of the raw sensor input."""
+    """Combine models' results on a benchmark, and score the raw sensor input."""
     if benchmark.stimuli != STIMULI:
         return Results(benchmark, tuple(models), None, {})
     raw = score(benchmark, {"raw": stimuli.raw()})
@@ -67,7 +67,7 @@ def model_result(
     untrained: Layers | None = None,
     performance: tuple[float, str] | None = None,
 ) -> ModelResult:
-    """Score a model's layers, and run the Turing test if the protocol is strict."""
+    """Score a model and its untrained network; under strict, run the Turing test too."""
     patterns = layers.patterns
     made = score(benchmark, patterns)
     # The test needs the stimuli's names, which paper-code does not have.
@@ -95,7 +95,7 @@ def model_result(
 def _note_missing_rdms(
     patterns: Mapping[str, NDArray[np.float64]], names: Sequence[str]
 ) -> Iterator[str]:
-    """Yield notes on layers without an RDM and so without score, one per cause."""
+    """Yield a note for each group of layers without an RDM for the same stimuli."""
     found: dict[tuple[str, ...], list[str]] = {}
     for layer, responses in patterns.items():
         varies = np.asarray(np.isfinite(normalise_vectors(responses)).all(axis=1))
@@ -111,7 +111,7 @@ def _note_missing_rdms(
 
 
 def read_results(path: Path) -> Results:
-    """Read scores from the JSON file of `tactile-rt align score`."""
+    """Read and check scores from a JSON file of `tactile-rt align score`."""
     results = read_json(path, Results, "tactile-rt align score --json")
     check_benchmark(results.benchmark, path)
     targets = tuple(t.name for t in results.benchmark.all_targets)

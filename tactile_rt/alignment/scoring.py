@@ -1,4 +1,4 @@
-"""Scores of a model's layers against a frozen benchmark."""
+"""Scoring of a model's layers against a frozen benchmark."""
 
 from collections.abc import Mapping, Sequence
 
@@ -15,7 +15,7 @@ from tactile_rt.core.stream.stimuli import STIMULI
 
 
 class Score(msgspec.Struct, frozen=True, eq=False):
-    """Fits of a model's layers to a benchmark's targets, and the score.
+    """The score of a model on a benchmark, with its layers' fits to all targets.
 
     Attributes:
         targets: The names of the targets; for paper-code the pooled animals are the last.
@@ -24,14 +24,15 @@ class Score(msgspec.Struct, frozen=True, eq=False):
         corrected: (layer, target) Correlations after the correction for noise; NaN where a layer
             has no RDM or a target is too noisy.
         unfiltered: (layer, target) Corrected correlations without the protocol's filter of units.
-        reliable: (target,) Whether each target counts in the score.
-        chosen: The names of the chosen layers: for strict, per target the layer that is best on all
+        reliable: (target,) True for targets that count in the score.
+        chosen: (target,) The names of the chosen layers: for strict, the layer that is best on all
             other animals, "" if none can be chosen; for paper-code, the layer of the score.
         per_target: (target,) The chosen layer's corrected correlation; NaN for unreliable targets.
         score: The score: for strict, the mean of `per_target`; for paper-code, the highest of
             `corrected`.
         p: The share of relabellings of the stimuli, with layers chosen anew for each, that reach
             the score; for six stimuli at least 1/720.
+        null_95: The 95th percentile of the score over relabellings.
     """
 
     protocol: str
@@ -51,7 +52,7 @@ class Score(msgspec.Struct, frozen=True, eq=False):
 
 
 def layer_rdms(layers: Mapping[str, ArrayLike], stimuli: int = len(STIMULI)) -> Floats:
-    """Compute RDMs (layer, pair) of responses (stimulus, unit); NaN if there is one unit."""
+    """Compute RDMs (layer, pair) from layers' responses (stimulus, unit)."""
     rdms = np.empty((len(layers), len(upper(stimuli)[0])))
     for i, (name, values) in enumerate(layers.items()):
         patterns = np.asarray(values, dtype=np.float64)
@@ -64,12 +65,12 @@ def layer_rdms(layers: Mapping[str, ArrayLike], stimuli: int = len(STIMULI)) -> 
 
 
 def score(benchmark: Benchmark, layers: Mapping[str, ArrayLike]) -> Score:
-    """Score layers, given as responses (stimulus, unit) in the order of the benchmark's stimuli."""
+    """Score a model from its layers' responses (stimulus, unit), in the benchmark's order."""
     return score_rdms(benchmark, tuple(layers), layer_rdms(layers, len(benchmark.stimuli)))
 
 
 def score_rdms(benchmark: Benchmark, names: Sequence[str], rdms: ArrayLike) -> Score:
-    """Score layers, given as RDMs (layer, pair); a layer with a NaN scores NaN."""
+    """Score a model from its layers' RDMs (layer, pair); layers with NaN do not count."""
     rdms = np.asarray(rdms, dtype=np.float64)
     if not names or rdms.shape != (len(names), len(upper(len(benchmark.stimuli))[0])):
         raise ConfigError(f"{len(names)} layers and RDMs {rdms.shape} do not fit")

@@ -1,4 +1,4 @@
-"""Selection of the recordings and units that a benchmark is made of."""
+"""Selection of sessions and units of recordings."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -47,10 +47,10 @@ class Selection:
         depth: str | None = None,
         cells: str | None = None,
     ) -> "Selection":
-        """Make a selection from texts; depth is a layer, ``L4``, or range, ``419-626`` um.
+        """Parse a selection; `depth` is a layer, ``L4``, or a range in um, ``419-626``.
 
         Raises:
-            ConfigError: no such task, layer or cell type, or an invalid range.
+            ConfigError: the task, layer or cell type does not exist, or the range is invalid.
         """
         for what, value, known in (("task", task, TASKS), ("cell type", cells, CELLS)):
             if value is not None and value not in known:
@@ -58,20 +58,20 @@ class Selection:
         return cls(task, tuple(sessions), _parse_depths(depth) if depth else None, cells)
 
     def takes(self, session: str) -> bool:
-        """Return whether a session's name matches."""
+        """Return whether a session's name matches the selection."""
         return not self.sessions or any(fnmatchcase(session, f"*{p}*") for p in self.sessions)
 
     def units(
         self, depth: NDArray[np.float64] | None, inhibitory: NDArray[Any] | None, number: int
     ) -> NDArray[np.bool_]:
-        """Return a mask (unit,) of the units of a session to keep.
+        """Return a mask (unit,) of a session's selected units.
 
         Args:
-            depth: (unit,) in um below the pia, or None.
-            inhibitory: (unit,) or None.
+            depth: (unit,) in um below the pia; None if unknown.
+            inhibitory: (unit,) True or 1 for a putative inhibitory unit; None if unknown.
 
         Raises:
-            ConfigError: a selected property is unknown for the session's units.
+            ConfigError: units are selected by a property that is unknown for the session.
         """
         kept = np.ones(number, dtype=np.bool_)
         if self.depth_um is not None:
@@ -115,7 +115,7 @@ TARGET_PARTS = ("all", *LAYERS_UM, *CELLS)
 
 
 def part_of(animals: Sequence[Animal], part: str) -> tuple[Animal, ...]:
-    """Keep the units of one part of cortex; animals without any are left out.
+    """Select the units of one part of cortex; animals without such units are left out.
 
     The borders of layers are those of `LAYERS_UM`, though they differ between mice: units near a
     border are assigned by depth alone.

@@ -1,4 +1,4 @@
-"""Choice of a layer without the animal that it is scored on, and permutation tests.
+"""Leave-one-animal-out choice of a layer, and permutation tests over relabelled stimuli.
 
 Six stimuli can be relabelled in 720 ways, so the null distribution is exact; for more than seven
 stimuli it is sampled (`rdm.relabellings`). Every step that uses the neural data, including the
@@ -13,8 +13,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from tactile_rt.alignment.rdm import Floats, count_stimuli, normalise_vectors, relabellings
 
-# Values that Student's t exceeds in one of 8 or 10 cases, for 1, 2, ... degrees of freedom; the
-# last is that of the normal distribution, for more degrees.
+# Values that Student's t exceeds with probability 1/8 or 1/10, for 1, 2, ... degrees of freedom;
+# the last value, for more degrees, is that of the normal distribution.
 STUDENT = {
     8: (2.414, 1.604, 1.423, 1.344, 1.301, 1.273, 1.254, 1.240, 1.230, 1.221, 1.214, 1.209, 1.204,
         1.200, 1.197, 1.194, 1.191, 1.189, 1.187, 1.185, 1.183, 1.182, 1.180, 1.179, 1.178, 1.177,
@@ -26,7 +26,7 @@ STUDENT = {
 Statistic = Callable[[Floats], Floats]
 
 TIE = 1e-12  # rounding error of relabellings that do not change an RDM, and so its statistic
-AT_ONCE = 1 << 24  # numbers per batch: for 50 stimuli and many layers, all would take gigabytes
+AT_ONCE = 1 << 24  # numbers per batch: 50 stimuli and many layers would need gigabytes at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,20 +34,20 @@ class Permutations:
     """A statistic and its null distribution over relabelled stimuli."""
 
     statistic: float  # statistic of the true labels; NaN if it cannot be computed
-    null: Floats  # (way,) statistics of all relabellings, the identity first: 720 of six stimuli
-    p: float  # share of relabellings that reach the statistic, at least one of them
-    percentile_95: float
+    null: Floats  # (way,) statistics of all relabellings, the identity first: 720 for six stimuli
+    p: float  # share of relabellings that reach the statistic, the identity included
+    percentile_95: float  # of `null`
 
 
 def held_out(values: ArrayLike) -> tuple[Floats, NDArray[np.intp]]:
-    """Score each animal by the layer that is best on the mean of all others.
+    """Score each animal by the layer with the best mean over all other animals.
 
     Args:
         values: (..., layer, animal), finite.
 
     Returns:
-        Scores (..., animal) and chosen layers (..., animal), the first of equals. With fewer than
-        two animals, or without layers, all are NaN and -1.
+        Scores (..., animal) and indices of the chosen layers (..., animal). With fewer than two
+        animals, or without layers, all are NaN and -1.
     """
     values = np.asarray(values, dtype=np.float64)
     layers, animals = values.shape[-2:]
@@ -61,7 +61,7 @@ def held_out(values: ArrayLike) -> tuple[Floats, NDArray[np.intp]]:
 
 
 def mean_held_out(values: Floats) -> Floats:
-    """Average `held_out` scores over animals: (..., layer, animal) -> (...)."""
+    """Average the scores of `held_out` over animals: (..., layer, animal) -> (...)."""
     return np.asarray(held_out(values)[0].mean(axis=-1))
 
 
@@ -75,7 +75,7 @@ def highest(values: Floats) -> Floats:
 def max_statistic(
     rdms: ArrayLike, targets: ArrayLike, factors: ArrayLike, statistic: Statistic = mean_held_out
 ) -> Permutations:
-    """Test a statistic that chooses among layers, by relabelling the stimuli.
+    """Run a permutation test of a statistic over layers and targets, relabelling the stimuli.
 
     Args:
         rdms: (layer, pair) of a model; a layer with a NaN is left out.
@@ -107,10 +107,10 @@ def max_statistic(
 
 
 def standard_error(values: ArrayLike, ddof: int = 1) -> float:
-    """Compute the s.e.m. over animals with a finite value; NaN if these are too few.
+    """Compute the standard error of the mean of finite values; NaN if too few.
 
     Args:
-        ddof: degrees of freedom to deduct for the mean; 0 in the published analysis.
+        ddof: degrees of freedom deducted for the mean; 0 in the published analysis.
     """
     finite = np.asarray(values, dtype=np.float64)
     finite = finite[np.isfinite(finite)]

@@ -1,8 +1,8 @@
 """Loads of an array that whisks the six stimuli: the input of models to score.
 
-The input of the right mouse array ships, so that scoring needs no simulator; for any other array,
-`tactile-rt whisk --array ...` makes it. A stimulus has 22 steps of 5 sub-steps from the first
-contact on.
+The input for the right mouse array is in this package, so that scoring needs no simulator; for any
+other array, `tactile-rt whisk --array ...` makes it. A stimulus has 22 steps of 5 sub-steps from
+the first contact on.
 """
 
 import hashlib
@@ -24,13 +24,13 @@ STEPS, SUBSTEPS, PERIOD_MS = 22, 5, 9
 
 @dataclass(frozen=True, eq=False)
 class StimuliInput:
-    """Loads of the six stimuli, in the order of `STIMULI`.
+    """Loads that an array measures for the six stimuli, in the order of `STIMULI`.
 
     Attributes:
         samples: (6, step, sub-step, element, channel) The loads while the array whisks each
             stimulus, float32, N and N m.
-        sigma: (6, element, channel) The noise at rest, float32, N and N m: the smallest assumed
-            for a sensor. The baseline is zero, since the whiskers are at rest before they whisk.
+        sigma: (6, element, channel) The noise at rest, float32, N and N m: the smallest that is
+            assumed for a sensor.
         elements, channels, units: Names along the last two axes, and the unit of each channel.
     """
 
@@ -44,7 +44,7 @@ class StimuliInput:
 
     @property
     def offset(self) -> NDArray[np.float32]:
-        """Baseline (6, element, channel), float32, N and N m: zeros."""
+        """Baseline (6, element, channel), N and N m: zero, since whiskers start at rest."""
         return np.zeros_like(self.sigma)
 
     def check(self, spec: ArraySpec, steps: int, substeps: int, model: str, period_ns: int) -> None:
@@ -80,13 +80,13 @@ class StimuliInput:
             )
 
     def raw(self) -> NDArray[np.float64]:
-        """Return the loads averaged over time as a control, (6, element * channel), SI."""
+        """Return loads averaged over time (6, element * channel), SI, as a control."""
         mean: NDArray[np.float64] = self.samples.astype(np.float64).mean(axis=(1, 2))
         return mean.reshape(len(STIMULI), -1)
 
 
 def read_stimuli(path: Path | None = None) -> StimuliInput:
-    """Read a file of `tactile-rt whisk`; without a path, the input that ships."""
+    """Read a file of `tactile-rt whisk`; without a path, this package's input."""
     path = SHIPPED if path is None else path
     check_no_pointer(path)
     try:

@@ -1,13 +1,13 @@
 """The default protocol `strict`: named stimuli, cross-fitted choice of units, noise correction.
 
-- Stimuli are named; sessions pool by name, and stimuli that were not shown do not count.
+- Stimuli have names; sessions are pooled by name, and stimuli that were not shown do not count.
 - *Cross-fit.* Trials are divided in two within every session and stimulus: units are chosen on one
   half (reliability of their tuning > 0.5) and scored on the other, and vice versa. An RDM is the
   mean over many such divisions, in both directions, so that it depends little on a single one.
-- An animal's reliability is that of the RDM of a scored half: the RDMs of its own two halves have
-  a correlation r, and Spearman-Brown is applied to the mean of r over all divisions, including
-  negative ones. It corrects for noise once, and an animal at or below zero is not scored. Only
-  animals whose RDM has a reliability of at least 0.5 count in a mean.
+- An animal's reliability is that of the RDM of a scored half: the RDMs of the half's own two halves
+  have a correlation r, and Spearman-Brown is applied to the mean of r over all divisions, including
+  negative values. It is used to correct for noise; an animal at or below zero is not scored. Only
+  animals whose RDM has a reliability of at least 0.5 count in mean scores.
 - The same values without the choice of units are reported as well.
 - Divisions are drawn from trials in an order that depends only on the data (`canonical`), so that
   neither the order of files, trials and units nor the scale of rates matters.
@@ -36,14 +36,14 @@ from tactile_rt.alignment.reliability import BOOTSTRAPS, SEED, spearman_brown
 from tactile_rt.core.errors import ConfigError, name_some
 
 MINIMUM_RELIABILITY = 0.5  # of a unit, and of an animal's RDM
-MINIMUM_TRIALS = 4  # of every stimulus in a session: two halves of two halves
+MINIMUM_TRIALS = 4  # of every stimulus in a session: one in each quarter
 TIE = 1e-9
-MINIMUM_UNITS = 5  # of an RDM: with fewer its correlations are mostly 1 or -1
+MINIMUM_UNITS = 5  # of an RDM: with fewer, correlations are mostly 1 or -1
 
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """Sums over units of responses to stimuli."""
+    """Sums over units of responses to stimuli and of their products, from which RDMs follow."""
 
     units: Floats  # (...) number of units in the sums
     sums: Floats  # (..., stimulus) sum over units of the response to each stimulus
@@ -70,12 +70,12 @@ class Moments:
 
 @dataclass(frozen=True, eq=False)
 class _Pool:
-    """Moments of one or more animals' units, in every division and both of its halves."""
+    """Moments of the units of one or more animals, for every division and its halves."""
 
     # (division, 2, ...) moments of the mean responses over each half of the trials, for the units
     # that were chosen on the other half
     halves: Moments
-    quarters: Moments  # (division, 2, 2, ...) the same for the two halves of each half
+    quarters: Moments  # (division, 2, 2, ...) moments for the two halves of each half
 
     def __add__(self, other: "_Pool") -> "_Pool":
         return _Pool(self.halves + other.halves, self.quarters + other.quarters)
@@ -111,7 +111,7 @@ def freeze_strict(
     seed: int = SEED,
     progress: Callable[[float], None] = lambda share: None,
 ) -> Benchmark:
-    """Compute reliabilities and RDMs of animals, and their consistency.
+    """Compute the benchmark of protocol strict from recordings.
 
     Args:
         animals: rates must count from first contact to choice, and no session may be given twice.
@@ -172,7 +172,7 @@ def freeze_strict(
 def _make_pools(
     sessions: Sequence[tuple[NeuralSession, int]], divisions: int, seed: int
 ) -> tuple[_Pool, _Pool]:
-    """Pool all units, and the reliable ones alone, of sessions and keys of `canonical`."""
+    """Pool all units, and only the reliable units, of sessions with keys from `canonical`."""
     every, kept = [], []
     for session, key in sessions:
         made = divide_trials(session, divisions, np.random.default_rng([seed, key]))
@@ -189,18 +189,18 @@ class Divided:
     """Random divisions of a session's trials in two, and of each half in two."""
 
     halves: Floats  # (division, 2, stimulus, unit) mean responses over each half of the trials
-    quarters: Floats  # (division, 2, 2, stimulus, unit) the same over each half of each half
-    # (division, 2, unit) whether the tuning of a unit over that half of the trials has a
+    quarters: Floats  # (division, 2, 2, stimulus, unit) mean responses over each half of a half
+    # (division, 2, unit) True if the tuning of a unit over that half of the trials has a
     # reliability above `MINIMUM_RELIABILITY`
     reliable: NDArray[np.bool_]
 
 
 def divide_trials(session: NeuralSession, divisions: int, rng: np.random.Generator) -> Divided:
-    """Divide trials within every stimulus at random.
+    """Divide a session's trials at random into halves and quarters, within every stimulus.
 
-    A unit's reliability is the share of the variance over stimuli of its mean responses that noise,
-    estimated from the variance within stimuli, does not explain: 1 - 1/F of an analysis of
-    variance. It equals the Spearman-Brown corrected correlation of two halves, without drawing any.
+    A unit's reliability is the share of the variance over stimuli of its mean responses that is not
+    noise, as estimated from the variance within stimuli: 1 - 1/F of an analysis of variance. It
+    equals the Spearman-Brown corrected correlation of two halves, without drawing halves.
     """
     units = session.rates.shape[1]
     stimuli = len(session.stimuli)
@@ -210,7 +210,7 @@ def divide_trials(session: NeuralSession, divisions: int, rng: np.random.Generat
     for stimulus in range(stimuli):
         rates = session.rates[session.stimulus == stimulus]
         n = len(rates)
-        # Sizes of the quarters differ by one at most, and so do those of the halves.
+        # Sizes of the quarters differ by at most one, and so do sizes of the halves.
         edges = np.array([n // 4, n // 2, n // 2 + (n - n // 2) // 2])
         place = np.searchsorted(edges, np.arange(n), side="right")
         drawn = rng.permuted(np.broadcast_to(place, (divisions, n)), axis=1)
@@ -225,7 +225,7 @@ def divide_trials(session: NeuralSession, divisions: int, rng: np.random.Generat
         noise += spread / (sizes - 1) / stimuli
     signal = halves.var(axis=2, ddof=1)
     varies = signal > CONSTANT * (halves**2).mean(axis=2)
-    # Spike counts are integers, so a unit may be exactly at the limit: rounding must not decide.
+    # Spike counts are integers, so a unit may be exactly at the limit: TIE decides, not rounding.
     reliable = varies & (noise < (1 - MINIMUM_RELIABILITY - TIE) * signal)
     return Divided(halves, quarters.reshape(divisions, 2, 2, stimuli, units), reliable)
 
@@ -251,7 +251,7 @@ def _compare_animals(
 
 
 def moments_of(patterns: Floats, counted: NDArray[np.bool_] | None = None) -> Moments:
-    """Sum responses (..., stimulus, unit) over the units, or those `counted` (..., unit)."""
+    """Compute moments of responses (..., stimulus, unit) over all or `counted` units."""
     if counted is None:
         units = np.full(patterns.shape[:-2], float(patterns.shape[-1]))
     else:
@@ -267,22 +267,22 @@ def moments_of(patterns: Floats, counted: NDArray[np.bool_] | None = None) -> Mo
 Keys = NDArray[np.uint64]
 
 ROUNDS = 3
-SAME = 1e-9  # rates with a smaller relative difference are the same, but for rounding
+SAME = 1e-9  # rates with a smaller relative difference count as equal
 
 
 def canonical(session: NeuralSession) -> tuple[NeuralSession, int]:
-    """Put a session's trials and units into an order that depends only on the data.
+    """Sort a session's trials and units into an order that depends only on the data.
 
     Returns:
-        The session with rates and stimuli alone, its trials sorted by stimulus; and a key below
-        2^64 of its data, which no order of trials or units and no scale of the rates changes.
+        The session with only rates and stimuli, its trials sorted by stimulus; and a hash of the
+        data below 2^64 that does not depend on the order of trials or units or the scale of rates.
     """
     ranks = _rank_rates(session.rates)
     trial = _mix(session.stimulus.astype(np.uint64) + np.uint64(1))
     trial, unit = _refine(ranks, trial)
     key = int(trial.sum(dtype=np.uint64))
     while len(found := _find_repeated(trial)):
-        # These may be exchanged, but only together with units: one of them is put first.
+        # These may be exchanged, but only together with units: put one of these trials first.
         trial[found[0]] = _mix(trial[found[:1]])[0]
         trial, unit = _refine(ranks, trial)
     rows, columns = np.lexsort((trial, session.stimulus)), np.argsort(unit)
@@ -311,7 +311,7 @@ def _find_repeated(keys: Keys) -> NDArray[np.intp]:
 
 
 def _rank_rates(rates: NDArray[np.float64]) -> Keys:
-    """Rank each rate among all, equal ones alike, and mix the ranks into 64 bits."""
+    """Return a hash of each rate's rank among all rates; equal rates share ranks."""
     order = np.argsort(rates, axis=None)
     sorted_ = rates.ravel()[order]
     steps = np.diff(sorted_) > SAME * np.maximum(np.abs(sorted_[1:]), np.abs(sorted_[:-1]))
@@ -321,7 +321,7 @@ def _rank_rates(rates: NDArray[np.float64]) -> Keys:
 
 
 def _mix(keys: Keys) -> Keys:
-    """Scatter each key over 64 bits (the finaliser of SplitMix64, Steele et al. 2014)."""
+    """Hash each key to 64 bits (the finaliser of SplitMix64, Steele et al. 2014)."""
     keys = keys + np.uint64(0x9E3779B97F4A7C15)
     keys = (keys ^ (keys >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     keys = (keys ^ (keys >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)

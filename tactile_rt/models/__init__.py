@@ -1,6 +1,6 @@
 """Encoder-Attender-Decoder networks in torch, trained and evaluated. Needs the `train` extra.
 
-`alignment` and the RSA benchmark do without torch, so modules are imported only when used.
+`alignment` and the RSA benchmark run without torch, so modules are imported only when used.
 """
 
 from importlib import import_module

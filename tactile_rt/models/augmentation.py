@@ -1,17 +1,17 @@
-"""Augmentations of tactile windows: other forms that the same touch could have had.
+"""Augmentations of tactile windows: variants that the same touch could have produced.
 
-- "tactile": the array is mirrored across its columns or rows, turned by a quarter, time reversed;
-  drawn for every window, on the loads in SI units. Whiskers are only permuted, and force and
-  moment vectors are mirrored and turned with the array.
+- "tactile": the array is mirrored across its columns or rows, rotated by 90 degrees, reversed in
+  time; drawn for every window, on the loads in SI units. Whiskers are only permuted, and force
+  and moment vectors are mirrored and rotated with the array.
 - "tactile-paper": as published (Chung et al. 2025, Fig. 2b, and its code) on the frames: one draw
-  for a whole batch, vectors left as they are, and a turned 5 x 7 grid loses its outer columns.
+  for a whole batch, vectors unchanged, and a rotated 5 x 7 grid loses its outer columns.
 - "image": the control: colour jitter, greyscale, blur and noise (Chen et al. 2020), with the
   loads of a cell as its colours.
-- "image-paper", "image-paper-weak": the published controls, of SimCLR and of SimSiam: forces
-  are the three colours of a picture, moments those of another, from 0 to 1; one draw for a batch.
+- "image-paper", "image-paper-weak": the published controls, of SimCLR and of SimSiam: forces are
+  the colours of one picture, moments those of a second, from 0 to 1; one draw for a batch.
 
-Mirroring, turning and reversal of "tactile" happen in half of the windows each; the image
-operations as in SimCLR. Temporal masking blanks whole steps.
+Each symmetry and the reversal of "tactile" is applied to half of the windows; each operation of
+"image" with SimCLR's probability. Temporal masking sets whole steps to zero.
 """
 
 from collections.abc import Callable
@@ -31,21 +31,20 @@ from tactile_rt.models import published_pictures
 
 # A symmetry S (a reflection or a rotation of the mount frame) takes element i to the place of
 # element j, whose own direction is R_j x. Loads are in each element's own frame: what j would feel
-# is the image S R_i f of the force, turned by the smallest rotation Q that takes the image of i's
-# direction to j's, in j's frame: f_j = R_j' Q S R_i f_i, m_j = det(S) R_j' Q S R_i m_i. So a load
-# along the whisker stays one, a bending keeps its direction in the head, and M = r x F holds before
-# and after.
+# is the image S R_i f of the force, rotated by the smallest rotation Q that takes the image of i's
+# direction to j's, in j's frame: f_j = R_j' Q S R_i f_i, m_j = det(S) R_j' Q S R_i m_i. So an axial
+# load stays axial, a bending keeps its direction in the head, and M = r x F holds before and after.
 VECTORS = {"f": "N", "m": "N m"}  # name of a vector's components and their unit
 AXES = "xyz"
 
 
 @dataclass(frozen=True)
 class Symmetry:
-    """A symmetry of an array: which loads each element takes, and how they are turned.
+    """A symmetry of an array: a permutation of elements and matrices for their loads.
 
     Attributes:
-        source: (element,) The index of the element whose loads each element takes.
-        matrix: (element, channel, channel) The matrix that those loads are multiplied by.
+        source: (element,) The index of the element whose loads each element receives.
+        matrix: (element, channel, channel) The matrix that multiplies the received loads.
     """
 
     source: NDArray[np.int64]
@@ -53,11 +52,11 @@ class Symmetry:
 
 
 def symmetries(spec: ArraySpec) -> tuple[Symmetry, Symmetry, Symmetry]:
-    """Return an array's symmetries: mirrored across columns, across rows, turned by a quarter.
+    """Return an array's symmetries: mirrored across columns, across rows, rotated by 90 degrees.
 
-    In a ragged grid every row (column) is reversed by itself, so that no whisker is lost. For a
-    quarter turn, which a grid of 5 x 7 does not have, the grid is stretched to a square and every
-    whisker goes to the nearest place, no two to the same.
+    In a ragged grid every row (column) is reversed by itself, so that no whisker is lost. For the
+    rotation, a grid that is not square (5 x 7) is first stretched to a square; then every whisker
+    is assigned to the nearest place, each to a different one.
 
     Raises:
         ConfigError: the grid is a single line, or a channel is part of no force or moment vector.
@@ -73,7 +72,7 @@ def symmetries(spec: ArraySpec) -> tuple[Symmetry, Symmetry, Symmetry]:
 
 
 def compose(spec: ArraySpec, *steps: Symmetry) -> Symmetry:
-    """Return the symmetry that applies the given ones from last to first; none: identity."""
+    """Compose symmetries, applied from last to first; return the identity if none is given."""
     n, channels = spec.shape
     source = np.arange(n)
     matrix = np.tile(np.eye(channels), (n, 1, 1))
@@ -83,7 +82,7 @@ def compose(spec: ArraySpec, *steps: Symmetry) -> Symmetry:
 
 
 def _mirror_places(grid: NDArray[np.int64], line: int) -> NDArray[np.int64]:
-    """Return (element,) every whisker's mirror in its row (line 0) or column (line 1)."""
+    """Return every whisker's mirror image (element,) in its row (line 0) or column (line 1)."""
     source = np.arange(len(grid))
     for value in np.unique(grid[:, line]):
         members = np.flatnonzero(grid[:, line] == value)
@@ -93,7 +92,7 @@ def _mirror_places(grid: NDArray[np.int64], line: int) -> NDArray[np.int64]:
 
 
 def _turn_places(grid: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return (element,) the whisker that a quarter turn (column to row) puts in each place."""
+    """Return the whisker (element,) that a rotation by 90 degrees moves to each place."""
     low, high = grid.min(0), grid.max(0)
     square = 2 * (grid - low) / (high - low) - 1  # (row, column) in [-1, 1]
     image = np.stack([square[:, 1], -square[:, 0]], axis=1)
@@ -103,7 +102,7 @@ def _turn_places(grid: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _fit_directions(spec: ArraySpec) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return mount-frame unit vectors along growing columns and, across them, growing rows."""
+    """Fit unit vectors in the mount frame along columns and, perpendicular to them, along rows."""
     grid = np.array(spec.grid, dtype=np.float64)
     positions = np.array(spec.positions, dtype=np.float64)
     design = np.column_stack([grid, np.ones(len(grid))])
@@ -138,7 +137,7 @@ def _symmetry(spec: ArraySpec, source: NDArray[np.int64], image: NDArray[np.floa
 
 
 def _find_vectors(spec: ArraySpec) -> dict[str, NDArray[np.int64]]:
-    """Return channel indices (x, y, z) of the force and the moment."""
+    """Return the channel indices (x, y, z) of the vectors "f" and "m", if present."""
     found = {}
     for vector, unit in VECTORS.items():
         names = [vector + axis for axis in AXES]
@@ -157,7 +156,7 @@ def _find_vectors(spec: ArraySpec) -> dict[str, NDArray[np.int64]]:
 
 
 def _smallest_rotation(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the rotation by the smallest angle that takes unit vector a to b (Rodrigues)."""
+    """Return the smallest rotation that takes unit vector a to unit vector b (Rodrigues)."""
     v, c = np.cross(a, b), float(a @ b)
     if c < -1 + 1e-9:  # opposite: half a turn about any normal axis, the same for b to a
         across = np.cross(a, np.eye(3)[np.abs(a).argmin()])
@@ -170,11 +169,11 @@ def _smallest_rotation(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArra
 
 
 HALF = 0.5
-JITTER, JITTER_CHANCE, GREY_CHANCE, NOISE = 0.8, 0.8, 0.2, 0.1  # SimCLR's; noise of the logarithm
+JITTER, JITTER_CHANCE, GREY_CHANCE, NOISE = 0.8, 0.8, 0.2, 0.1  # SimCLR's; noise on log loads
 BLUR = (1.0, 2.0, 1.0)
 
 T = TypeVar("T")
-Loads = tuple[Tensor, Tensor, Tensor]  # samples, offset, sigma as `InputStage` takes them
+Loads = tuple[Tensor, Tensor, Tensor]  # samples, offset, sigma: the input of `InputStage`
 
 
 def _as_is(x: T, _: Generator) -> T:
@@ -183,14 +182,14 @@ def _as_is(x: T, _: Generator) -> T:
 
 @dataclass(frozen=True)
 class Augmentation:
-    """Functions that augment a batch before and after the input stage, drawing from a generator.
+    """Random augmentations of a batch: of loads, of frames, and by masked steps.
 
     Attributes:
-        loads: The function that augments loads: (samples, offset, sigma) in SI units and a CPU
-            generator, to the same three.
-        frames: The function that augments frames: (batch, step, sub-step * channel, row, column)
-            and a generator on their device, to the same shape.
-        mask: The function that blanks steps of such frames.
+        loads: Function of (samples, offset, sigma) in SI units and a CPU generator; returns the
+            three augmented. It runs before the input stage.
+        frames: Function of frames (batch, step, sub-step * channel, row, column) and a generator on
+            their device; returns them augmented. It runs after the input stage.
+        mask: Function of the same arguments as `frames` that sets some steps to zero.
     """
 
     loads: Callable[[Loads, Generator], Loads]
@@ -202,7 +201,7 @@ def build(name: str, spec: ArraySpec, masking: float = 0.0) -> Augmentation:
     """Build an augmentation by name.
 
     Args:
-        masking: share of steps that are blanked as well.
+        masking: share of each window's steps that are also set to zero.
 
     Raises:
         ConfigError: the array has no symmetries ("tactile"), or its channels are not the colours
@@ -238,10 +237,10 @@ def build(name: str, spec: ArraySpec, masking: float = 0.0) -> Augmentation:
 
 
 class Tactile:
-    """Mirroring, turning and time reversal of the loads themselves, drawn for every window.
+    """Augmentation of loads by mirroring, rotation and time reversal, drawn for every window.
 
     Raises:
-        ConfigError: the array's channels are neither forces nor moments, or it is no grid.
+        ConfigError: a channel is part of no force or moment, or the array is a single line.
     """
 
     def __init__(self, spec: ArraySpec) -> None:
@@ -258,9 +257,9 @@ class Tactile:
         return self.transform(loads, which, reverse)
 
     def transform(self, loads: Loads, which: Tensor, reverse: Tensor) -> Loads:
-        """Transform windows by symmetry `which` (batch,); reverse time where `reverse` (batch,).
+        """Apply symmetry number `which` (batch,); reverse time where `reverse` (batch,) is True.
 
-        A reversed movement bends a whisker the other way: its loads change their sign.
+        A reversed movement bends a whisker the other way, so its loads change their sign.
         """
         samples, offset, sigma = loads
         device = samples.device
@@ -271,7 +270,7 @@ class Tactile:
         moved = torch.einsum("besj,beij->besi", flat, matrix * sign[:, None, None, None])
         moved = torch.where(reverse[:, None, None, None], moved.flip(2), moved)
         offset = torch.einsum("bej,beij->bei", offset[each, source], matrix)
-        # Independent noises of several channels add up in one.
+        # A rotated channel mixes several: the variances of their independent noises add up.
         variance = torch.einsum("bej,beij->bei", sigma[each, source] ** 2, matrix**2)
         return (
             moved.transpose(1, 2).reshape(samples.shape),
@@ -281,10 +280,10 @@ class Tactile:
 
 
 def tactile_paper(frames: Tensor, generator: Generator, channels: int = 6) -> Tensor:
-    """Augment frames as published, with one draw for the batch.
+    """Flip, rotate and reverse frames as published, with one draw for the batch.
 
-    Columns or rows, with even chances, are flipped in half of the cases; the four quarter turns
-    are equally likely; half of the batches run backwards.
+    Half of the batches are flipped, along columns or rows with equal probability; rotations by 0,
+    90, 180 and 270 degrees are equally likely; half of the batches are reversed in time.
 
     Args:
         frames: (batch, step, sub-step * channel, row, column).
@@ -301,13 +300,13 @@ def tactile_paper(frames: Tensor, generator: Generator, channels: int = 6) -> Te
 def as_published(
     frames: Tensor, mirrored: int, turns: int, reverse: bool, channels: int = 6
 ) -> Tensor:
-    """Augment frames as `tactile_paper` does, with what it draws given.
+    """Flip, rotate and reverse frames as `tactile_paper` does, with the given parameters.
 
     Args:
         frames: (batch, step, sub-step * channel, row, column).
-        mirrored: the axis that is flipped, -1 or -2; 0: none.
-        turns: quarter turns, counter-clockwise; what leaves the grid is lost.
-        reverse: run all sub-steps backwards, with the other sign.
+        mirrored: the axis to flip, -1 or -2; 0: none.
+        turns: counter-clockwise rotations by 90 degrees; cells that leave the grid are lost.
+        reverse: reverse all sub-steps in time, with the opposite sign.
     """
     if mirrored:
         frames = frames.flip(mirrored)
@@ -320,7 +319,7 @@ def as_published(
 
 
 def turn_images(frames: Tensor, turns: int) -> Tensor:
-    """Return images turned by quarters, counter-clockwise; what leaves the grid is lost."""
+    """Rotate images counter-clockwise by `turns` * 90 degrees; cells outside the grid are lost."""
     if turns % 2 == 0:
         return frames.flip((-2, -1)) if turns % 4 else frames
     side = min(frames.shape[-2:])
@@ -332,7 +331,7 @@ def turn_images(frames: Tensor, turns: int) -> Tensor:
 
 
 def image(frames: Tensor, generator: Generator, colours: int = 6) -> Tensor:
-    """Augment frames as SimCLR does pictures, with a draw for every window.
+    """Augment frames as SimCLR augments pictures, with a separate draw for every window.
 
     Args:
         frames: (batch, step, sub-step * colour, row, column).
@@ -360,16 +359,16 @@ def image(frames: Tensor, generator: Generator, colours: int = 6) -> Tensor:
 
 
 def _blur(x: Tensor) -> Tensor:
-    """Blur frames (..., row, column), with the cells at an edge repeated beyond it.
+    """Blur frames (..., row, column); cells at an edge are repeated beyond it.
 
-    One product over all cells: as a convolution of single channels it takes twenty times as long.
+    One matrix product over all cells: a convolution by channel takes twenty times as long.
     """
     rows, columns = (_blur_matrix(n).to(x) for n in x.shape[-2:])
     return (x.flatten(-2) @ torch.kron(rows, columns).T).view(x.shape)
 
 
 def _blur_matrix(cells: int) -> Tensor:
-    """Return (cell, cell) weights: a line's blurred cells (rows) from its cells (columns)."""
+    """Return the matrix (blurred cell, cell) that blurs a line of `cells` cells."""
     weights = torch.tensor(BLUR) / sum(BLUR)
     reach = len(BLUR) // 2
     shares = torch.zeros(cells, cells)
@@ -380,7 +379,7 @@ def _blur_matrix(cells: int) -> Tensor:
 
 
 def mask_steps(frames: Tensor, share: float, generator: Generator) -> Tensor:
-    """Blank a share of every window's steps, drawn for each window."""
+    """Set a share of every window's steps to zero, drawn at random for each window."""
     n, steps = frames.shape[:2]
     order = torch.rand(n, steps, generator=generator, device=frames.device).argsort(1).argsort(1)
     kept = order >= round(share * steps)

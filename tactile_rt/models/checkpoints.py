@@ -1,7 +1,7 @@
-"""Checkpoints of networks: their contents, the sets that they fit, and their networks.
+"""Checkpoints of networks: read, written, checked against sweep sets, and loaded as networks.
 
-torch writes an archive: a pickle of everything but the numbers of tensors, which lie beside it.
-Reading without torch skips the numbers and makes only plain values of the pickle. Importing torch
+torch writes an archive: a pickle of everything but the values of tensors, which are other members.
+Reading without torch skips these values and accepts only plain Python objects. Importing torch
 takes seconds, so it is imported only where a network is made, after all other checks.
 """
 
@@ -36,10 +36,10 @@ NETWORK = (
 
 
 def describe_checkpoint(path: Path) -> dict[str, Any]:
-    """Read the contents of a `best.pt`; every tensor is None.
+    """Read the contents of a `best.pt` without torch; every tensor is None.
 
     Raises:
-        ModelError: missing, or no such checkpoint; the numbers of tensors are not checked.
+        ModelError: the file is missing or no `best.pt`; the values of tensors are not checked.
     """
     check_no_pointer(path)
     try:
@@ -63,18 +63,18 @@ def describe_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def network_of(path: Path) -> dict[str, Any]:
-    """Read the fields of a checkpoint's network that a training configuration has too."""
+    """Read a network's options from a checkpoint, for use in a training configuration."""
     network = describe_checkpoint(path)["network"]
     return {key: value for key, value in network.items() if key in NETWORK}
 
 
 def no_checkpoint(path: Path, error: Exception) -> ModelError:
-    """Return the error to raise for a file that is no checkpoint."""
+    """Return a ModelError that reports that a file is no checkpoint, and why."""
     return ModelError(f"{path} is not a checkpoint of `tactile-rt train`: {reason(error)}")
 
 
 def reason(error: Exception) -> str:
-    """Return an error's message in one line."""
+    """Return the first line of an error's message, or the error's type without one."""
     if isinstance(error, OSError) and error.strerror:
         return error.strerror
     return str(error).splitlines()[0] if str(error) else type(error).__name__
@@ -82,7 +82,7 @@ def reason(error: Exception) -> str:
 
 class _PlainUnpickler(pickle.Unpickler):
     def persistent_load(self, pid: Any) -> None:
-        """Return None for the numbers of a tensor."""
+        """Return None in place of the values of a tensor."""
 
     def find_class(self, module: str, name: str) -> Any:
         if (module, name) == ("collections", "OrderedDict"):
@@ -93,11 +93,11 @@ class _PlainUnpickler(pickle.Unpickler):
 
 
 def _skip_tensor(*_: Any) -> None:
-    """Return None for a tensor."""
+    """Return None in place of a tensor, whatever the arguments."""
 
 
 def check_array(checkpoint: Path, saved: Mapping[str, Any], manifest: SweepManifest) -> None:
-    """Check that a set has a checkpoint's array and as many samples in a step."""
+    """Check that a set and a checkpoint have the same array and samples per step."""
     spec = ArraySpec.from_json(saved["spec"])
     if differences := spec.differences(manifest.spec, ("name", "rate_hz")):
         raise SpecMismatch(f"{checkpoint} was made for another array: {differences[0]}")
@@ -114,14 +114,14 @@ def check_array(checkpoint: Path, saved: Mapping[str, Any], manifest: SweepManif
 def trained_on(
     checkpoint: Path, saved: Mapping[str, Any], data: Sequence[Path] = ()
 ) -> list[tuple[Path, SweepManifest]]:
-    """Find the sweep sets that a checkpoint was trained on: folders and manifests.
+    """Return folders and manifests of the sweep sets that a checkpoint was trained on.
 
     Args:
         data: folders of the sets; default: those in the checkpoint's configuration.
 
     Raises:
-        RecordingError: one is missing, or is no sweep set.
-        SpecMismatch: one is of another array, or they hold other categories.
+        RecordingError: a folder is missing, or is no sweep set.
+        SpecMismatch: a set is of another array, or the sets hold other categories.
     """
     config = saved["config"]
     folders = tuple(data) or tuple(map(Path, (config["data"], *config.get("also", ()))))
@@ -151,16 +151,16 @@ def trained_on(
 def probed_on(
     checkpoint: Path, saved: Mapping[str, Any], folder: Path, data: str = ""
 ) -> tuple[Path, SweepManifest]:
-    """Find the sweep set to probe a checkpoint on: folder and manifest.
+    """Return folder and manifest of the sweep set to probe a checkpoint on.
 
     Args:
-        data: the set; empty: the first of those that it was trained on.
+        folder: the folder to write the probe into.
+        data: the set's folder; empty: the first set that the checkpoint was trained on.
 
     Raises:
         RecordingError: the set is missing, or is no sweep set.
-        SpecMismatch: it is of another array.
-        ConfigError: the set has no labels; or the folder holds a trained network, which the probe
-            would replace.
+        SpecMismatch: the set is of another array.
+        ConfigError: the set has no labels, or `folder` holds a training run to be overwritten.
     """
     best = folder / "best.pt"
     if (folder / "config.json").exists() or (best.exists() and best.samefile(checkpoint)):
@@ -176,10 +176,10 @@ def probed_on(
 
 
 def load_checkpoint(path: Path) -> "tuple[TactileClassifier, dict[str, Any]]":
-    """Load the network of a `best.pt`, in evaluation mode on the CPU, and its contents.
+    """Load the network of a `best.pt` (evaluation mode, CPU) and the checkpoint's contents.
 
     Raises:
-        ModelError: missing, or not such a checkpoint.
+        ModelError: the file is missing, or is no `best.pt`.
     """
     import torch
 
@@ -199,20 +199,17 @@ def begin_from(
     labels: Sequence[str],
     kinds: Mapping[str, Sequence[str]],
 ) -> dict[str, Any]:
-    """Initialise a network with the weights of a checkpoint.
+    """Initialise a network with the weights of a checkpoint; return the checkpoint's contents.
 
     Args:
-        model: the same network, except that its labels and kinds may differ.
-        labels: the labels of the network; those that the checkpoint has by the same name begin
-            with its weights.
-        kinds: the kinds within each label, likewise.
-
-    Returns:
-        The checkpoint's contents.
+        model: a network of the checkpoint's architecture; its labels and kinds may differ.
+        labels: the labels of `model`; a label that the checkpoint has too gets the checkpoint's
+            row of the last layer, any other keeps its own.
+        kinds: the kinds within each label; their rows are copied likewise.
 
     Raises:
-        ModelError: no such checkpoint.
-        SpecMismatch: it is of another array or network.
+        ModelError: the file is missing, or is no `best.pt`.
+        SpecMismatch: the checkpoint is of another array or network.
     """
     trained, saved = load_checkpoint(path)
     there, here = asdict(trained.network.config), asdict(model.network.config)
@@ -239,13 +236,13 @@ def begin_from(
 def _name_rows(
     labels: Sequence[str], kinds: Mapping[str, Sequence[str]], network: Mapping[str, Any]
 ) -> list[Any]:
-    """Name the rows of the last layer: labels, kinds, units of the embedding."""
+    """List names of the last layer's rows: labels, (label, kind) pairs, embedding unit numbers."""
     names = [(label, kind) for label in kinds for kind in kinds[label]] if network["names"] else []
     return [*labels, *names, *range(network["identity"])]
 
 
 def build_untrained(saved: dict[str, Any]) -> "TactileClassifier":
-    """Make an untrained network as a checkpoint's, for the same channels."""
+    """Build a checkpoint's network for its array and channel limits, with random weights."""
     from tactile_rt.models.ead import TactileClassifier
 
     clip, scale = (saved["model"][f"inputs.{name}"].numpy() for name in ("clip", "scale"))
@@ -262,12 +259,13 @@ def fill_checkpoint(
     trained: Mapping[str, list[str]],
     metrics: Mapping[str, float],
 ) -> dict[str, Any]:
-    """Return the contents of a `best.pt` for a network.
+    """Return the contents of a `best.pt` for a trained network.
 
     Args:
-        manifest: the manifest of the set that it was trained on.
-        config: its training's configuration, as JSON values.
-        trained: names of the objects that it was trained on, by their source.
+        manifest: the manifest of the set that the network was trained on.
+        refusals: the labels that are no categories, such as "unknown".
+        config: the training configuration, as JSON values.
+        trained: the names of the training objects, by their source.
     """
     return {
         "model": model.state_dict(),
@@ -284,10 +282,10 @@ def fill_checkpoint(
 
 
 def save_whole(path: Path, state: dict[str, Any]) -> None:
-    """Write a checkpoint whole or not at all, even if the machine stops soon after.
+    """Write a checkpoint atomically, safe against a power failure.
 
     Raises:
-        OSError: the medium is full, or failed.
+        OSError: the disk is full, or failed.
     """
     import torch
 

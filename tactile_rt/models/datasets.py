@@ -1,7 +1,7 @@
-"""Stored sweeps in memory, and windows cut out of them at the onsets that a robot would find.
+"""Sweep sets in memory, and windows cut out of them at the onsets that a robot would detect.
 
-A window is what the classifier would feed the network: it starts where `ContactDetector` reports
-onset on the noisy signal, and carries the baseline that the detector had measured by then.
+A window is the input that the classifier would pass to the network: it starts where
+`ContactDetector` reports onset on the noisy signal, with the baseline that it has by then.
 """
 
 import hashlib
@@ -29,14 +29,14 @@ NOISE_LEVELS = (0.0, 0.25, 0.5, 1.0, 2.0)  # of the rated noise, at which traini
 
 @dataclass(frozen=True)
 class SweepSet:
-    """One split of a sweep set, with all that is needed to cut its windows.
+    """The sweeps of one split of a set, with the settings for cutting windows.
 
     Attributes:
         noise: (channel,) The rated noise per sample, SI.
         floor: (channel,) The smallest sigma of the detector, SI.
         window: The first sample of a sweep's window: "onset", where the detector finds contact,
             or "sweep", where the object starts to move, with the baseline measured until then.
-        joined_of: The manifests of the sets that it was joined from; empty for a single set.
+        joined_of: The manifests of the sets that were joined into this one; empty for a single set.
     """
 
     manifest: SweepManifest
@@ -48,22 +48,26 @@ class SweepSet:
 
     @classmethod
     def read(cls, folder: Path, split: str) -> "SweepSet":
-        """Read a split."""
+        """Read a split of the sweep set in a folder."""
         return cls.read_known(folder, SweepManifest.read(folder), split)
 
     @classmethod
     def read_known(cls, folder: Path, manifest: SweepManifest, split: str) -> "SweepSet":
-        """Read a split of a set whose manifest is known."""
+        """Read a split of the sweep set in a folder, given the set's manifest."""
         limits = manifest.limits
         return cls(manifest, read_split(folder, manifest, split), limits.noise, limits.floor)
 
     @property
     def manifests(self) -> tuple[SweepManifest, ...]:
-        """Manifests of the sets that its sweeps come from."""
+        """Manifests of the sets that the sweeps come from."""
         return self.joined_of or (self.manifest,)
 
     def onsets(self, values: NDArray[np.float32]) -> Onsets:
-        """Find where windows of (sweep, sample, element, channel) begin, and their baselines."""
+        """Find the first sample and the baseline of each window.
+
+        Args:
+            values: (sweep, sample, element, channel), SI; samples may be added before each sweep.
+        """
         if self.window == "onset":
             return find_onsets(values, self.floor)
         n, shape = len(values), self.manifest.spec.shape
@@ -78,12 +82,12 @@ class SweepSet:
 
     @property
     def timing(self) -> Timing:
-        """Numbers of steps and sub-steps in its windows."""
+        """Numbers of steps and sub-steps in a window."""
         return Timing.of(self.manifest.period_ns)
 
     @property
     def recorded(self) -> NDArray[np.bool_]:
-        """(sweep,) True where recorded: a sweep with its sensor's noise, which counts as rated."""
+        """Mask (sweep,) of recorded sweeps, whose own sensor noise counts as the rated noise."""
         none = np.zeros(len(self.sweeps), dtype=np.bool_)
         return none if self.sweeps.recorded is None else self.sweeps.recorded
 
@@ -92,26 +96,23 @@ class SweepSet:
 
     @property
     def refusals(self) -> tuple[str, ...]:
-        """Labels other than categories for a network that is trained on these sweeps."""
+        """Labels other than categories: "unknown" and faults, if training has examples of them."""
         unknown = (UNKNOWN,) if (self.sweeps.labels < 0).any() else ()
         named = implausible(self.manifest.spec) if self.manifest.faults.implausible else ()
         return (*unknown, *named)
 
     @property
     def classes(self) -> tuple[str, ...]:
-        """Labels for a network that is trained on these sweeps: categories, then refusals."""
+        """All labels of a network that is trained on these sweeps: categories, then refusals."""
         return (*self.manifest.categories, *self.refusals)
 
     def kinds(self, of: Mapping[str, Sequence[str]]) -> NDArray[np.int64]:
-        """Number the kind of each sweep's object; -1 where it has none of these.
+        """Return the number (sweep,) of each object's kind, -1 where `of` lacks the kind.
 
         Args:
-            of: the kinds of each category, numbered through all categories.
-
-        Returns:
-            (sweep,) numbers.
+            of: the kinds of each category; they are numbered consecutively over all categories.
         """
-        numbers = {one: k for k, one in enumerate((c, kind) for c in of for kind in of[c])}
+        numbers = {key: k for k, key in enumerate((c, kind) for c in of for kind in of[c])}
         names, which = np.unique(self.sweeps.objects, return_inverse=True)
         category, kind_of = self.manifest.category, self.manifest.kind_of
         found = [
@@ -122,9 +123,9 @@ class SweepSet:
 
     @cached_property
     def noisy_starts(self) -> NDArray[np.int64]:
-        """(level, sweep) onsets with noise of each of `NOISE_LEVELS`; -1 where none was found.
+        """First samples (level, sweep) of windows at each of `NOISE_LEVELS`; -1 without an onset.
 
-        Levels that training never draws are left out. Recorded sweeps have their own noise at every
+        Levels that training never draws are left out. Recorded sweeps get no added noise at any
         level.
         """
         rng, largest = np.random.default_rng(0), max(self.manifest.faults.noise, 1.0)
@@ -143,9 +144,9 @@ class SweepSet:
 
     @cached_property
     def baselines(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Offset and sigma (sweep, element, channel), SI, of recorded sweeps at their onsets.
+        """Baseline offset and sigma (sweep, element, channel), SI, of recorded sweeps at onset.
 
-        0 for simulated sweeps, for which training draws them."""
+        Both are 0 for simulated sweeps, whose baselines are drawn in training."""
         offset, sigma = np.zeros((2, len(self.sweeps), *self.manifest.spec.shape), dtype=np.float32)
         if self.recorded.any():
             found = self.onsets(self.sweeps.values[self.recorded])
@@ -156,9 +157,9 @@ class SweepSet:
 def windows(
     values: NDArray[np.float32], start: NDArray[np.int64], timing: Timing = MOUSE
 ) -> NDArray[np.float32]:
-    """Cut (sweep, step, sub-step, element, channel) windows that begin at `start` (sweep,).
+    """Cut windows (sweep, step, sub-step, element, channel) that begin at sample `start` (sweep,).
 
-    A window that reaches past the sweep's end repeats its last sample.
+    A window that reaches past the sweep's end repeats the sweep's last sample.
     """
     samples = start[:, None] + np.arange(timing.samples)
     samples = np.clip(samples, 0, values.shape[1] - 1)
@@ -170,14 +171,14 @@ def windows(
 
 
 def read_splits(folders: Sequence[Path], labelled: bool) -> tuple[SweepSet, SweepSet]:
-    """Read and check the training split, with outliers, and the validation split.
+    """Read, check and join the training and validation splits of sweep sets.
 
     Args:
-        folders: folders of sets to train on together.
-        labelled: whether training uses their labels.
+        folders: folders of the sets; the training split includes their outliers.
+        labelled: True if training uses the labels.
 
     Raises:
-        ConfigError: the sets cannot be joined, or one has no labels to learn from.
+        ConfigError: the sets cannot be joined, or a set has no labels and `labelled` is True.
         RecordingError: a set is missing, unfinished, damaged or unfit.
     """
     manifests, whole = read_manifests(folders, labelled)
@@ -196,9 +197,9 @@ def read_splits(folders: Sequence[Path], labelled: bool) -> tuple[SweepSet, Swee
 
 
 def join_sets(sets: Sequence[SweepSet]) -> SweepSet:
-    """Join sets of one array, with all their categories and the faults of the first.
+    """Join sets of one array, with all their categories and the first set's faults.
 
-    Shorter sweeps repeat their rest before the touch, and their last sample after it.
+    Shorter sweeps are padded: with their rest before the touch, with their last sample after it.
     """
     if len(sets) == 1:
         return sets[0]
@@ -220,7 +221,7 @@ def join_sets(sets: Sequence[SweepSet]) -> SweepSet:
 
 
 def _pad_sweeps(data: SweepSet, lead: int, after: int) -> NDArray[np.float32]:
-    """Return values (sweep, sample, element, channel) padded to `lead` + `after` samples."""
+    """Return values padded to `lead` samples before the touch and `after` samples from then on."""
     own, samples = data.manifest.lead, data.sweeps.values.shape[1]
     if (own, samples) == (lead, lead + after):
         return data.sweeps.values
@@ -230,30 +231,30 @@ def _pad_sweeps(data: SweepSet, lead: int, after: int) -> NDArray[np.float32]:
 
 
 def select_labelled(data: SweepSet) -> SweepSet:
-    """Return the set's labelled sweeps only, without implausible loads drawn in training."""
+    """Return a set of the labelled sweeps, for which training draws no implausible loads."""
     if not data.refusals:
-        return data  # keeps the onsets that were found before
+        return data  # with the onsets that it has cached
     known = np.flatnonzero(data.sweeps.labels >= 0)
     return with_faults(data[known], replace(data.manifest.faults, implausible=0.0))
 
 
 def drawn_as(data: SweepSet, training: Mapping[str, Any]) -> SweepSet:
-    """Return the set with the window and the sensor faults of a run's configuration."""
+    """Return the set with the window and sensor faults of a training configuration."""
     window = training.get("window", data.window)
-    if window != data.window:  # else trainings share the onsets that were found before
+    if window != data.window:  # otherwise the cached onsets are shared between trainings
         data = replace(data, window=window)
     faults = training.get("faults")
     return with_faults(data, SensorFaults(**faults)) if faults else data
 
 
 def with_faults(data: SweepSet, faults: SensorFaults) -> SweepSet:
-    """Return the set with other sensor faults for training to draw."""
+    """Return the set with `faults` as the sensor faults that training draws."""
     recipe = {**data.manifest.recipe, FAULTS: asdict(faults)}
     return replace(data, manifest=replace(data.manifest, recipe=recipe))
 
 
 def relabel_set(data: SweepSet, categories: Sequence[str]) -> SweepSet:
-    """Return the set with labels among these categories, which include its own."""
+    """Return the set with labels that index `categories`, which include the set's own."""
     place = np.array([*(categories.index(c) for c in data.manifest.categories), -1])
     return replace(
         data,
@@ -263,10 +264,10 @@ def relabel_set(data: SweepSet, categories: Sequence[str]) -> SweepSet:
 
 
 def check_sets(folder: Path, sets: Sequence[SweepSet]) -> None:
-    """Check that sweeps are finite and long enough, and none is in two splits.
+    """Check that sweeps are finite and long enough, and no object is in two splits.
 
     Raises:
-        RecordingError: otherwise; the message names the object.
+        RecordingError: a check fails; the message names the object or the length.
     """
     seen: dict[bytes, tuple[str, int]] = {}
     for number, data in enumerate(sets):

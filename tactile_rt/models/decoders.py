@@ -1,8 +1,8 @@
-"""Decoders: from the features of steps to the logits of classes.
+"""Decoders: networks that map the features of steps to the logits of classes.
 
 Every decoder maps features `(batch, step, feature)` to logits `(batch, step, class)`, where a
-step's logits use no later step. It does so in two parts: `embed` gives what its last linear layer
-reads, the embedding `(batch, step, unit)`, and `logits` is that layer. `step` embeds one by one.
+step's logits use no later step. It has two parts: `embed` returns the embedding `(batch, step,
+unit)`, the input of the last linear layer; `logits` applies that layer. `step` embeds one step.
 """
 
 import math
@@ -15,7 +15,7 @@ HIDDEN = (1024, 512)  # at width 1
 
 
 class LinearDecoder(nn.Linear):
-    """Each step alone: one layer at any width, so the features are the embedding."""
+    """Decoder of each step by one linear layer, so the features themselves are the embedding."""
 
     def __init__(self, features: int, classes: int, width: float = 1.0, steps: int = 22) -> None:
         super().__init__(features, classes)
@@ -25,7 +25,7 @@ class LinearDecoder(nn.Linear):
         return features
 
     def logits(self, embedding: Tensor) -> Tensor:
-        """(..., feature) -> (..., class)"""
+        """Map the embedding (..., feature) to logits (..., class)."""
         logits: Tensor = self(embedding)
         return logits
 
@@ -35,12 +35,12 @@ class LinearDecoder(nn.Linear):
     def step(
         self, features: Tensor, index: Tensor, state: dict[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """features (batch, feature) -> embedding (batch, feature), {}"""
+        """Return the features (batch, feature) of one step unchanged, and an empty state."""
         return features, {}
 
 
 class MLPDecoder(nn.Sequential):
-    """Each step alone: feature-1024-512-class at width 1 (Chung et al. 2025, model training)."""
+    """Decoder of each step by an MLP, feature-1024-512-class at width 1 (Chung et al. 2025)."""
 
     def __init__(self, features: int, classes: int, width: float = 1.0, steps: int = 22) -> None:
         wide, narrow = hidden(width)
@@ -53,13 +53,13 @@ class MLPDecoder(nn.Sequential):
         )
 
     def embed(self, features: Tensor) -> Tensor:
-        """features (..., feature) -> embedding (..., unit)"""
+        """Map features (..., feature) to the embedding (..., unit)."""
         for layer in list(self)[:-1]:
             features = layer(features)
         return features
 
     def logits(self, embedding: Tensor) -> Tensor:
-        """(..., unit) -> (..., class)"""
+        """Map the embedding (..., unit) to logits (..., class)."""
         logits: Tensor = self[-1](embedding)
         return logits
 
@@ -69,15 +69,15 @@ class MLPDecoder(nn.Sequential):
     def step(
         self, features: Tensor, index: Tensor, state: dict[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """features (batch, feature) -> embedding (batch, unit), {}"""
+        """Map one step's features (batch, feature) to an embedding (batch, unit), and no state."""
         return self.embed(features), {}
 
 
 class MLPAllDecoder(nn.Module):
-    """All steps of an episode: (steps * feature)-1024-512-class at width 1.
+    """Decoder of all steps so far by an MLP, (steps * feature)-1024-512-class at width 1.
 
-    At step t the features of later steps count as zero, so the last step's logits are the
-    paper's, and the first layer is a running sum of one product a step.
+    At step t the features of later steps count as zero. So the last step's logits are the
+    paper's, and the first layer is a running sum with one matrix product for each step.
     """
 
     def __init__(self, features: int, classes: int, width: float = 1.0, steps: int = 22) -> None:
@@ -92,11 +92,11 @@ class MLPAllDecoder(nn.Module):
         self.layer3 = nn.Linear(narrow, classes)
 
     def forward(self, features: Tensor) -> Tensor:
-        """features (batch, step, feature) -> logits (batch, step, class), as `embed`"""
+        """Map features (batch, step, feature) to logits (batch, step, class)."""
         return self.logits(self.embed(features))
 
     def embed(self, features: Tensor) -> Tensor:
-        """features (batch, step, feature) -> embedding (batch, step, unit)
+        """Map features (batch, step, feature) to the embedding (batch, step, unit).
 
         Raises:
             ValueError: more steps than the decoder has weights for.
@@ -110,20 +110,20 @@ class MLPAllDecoder(nn.Module):
         return self._apply_rest(products.cumsum(1, dtype=exact))
 
     def logits(self, embedding: Tensor) -> Tensor:
-        """(..., unit) -> (..., class)"""
+        """Map the embedding (..., unit) to logits (..., class)."""
         logits: Tensor = self.layer3(embedding)
         return logits
 
     def initial_state(self, batch: int) -> dict[str, Tensor]:
-        """Return zeros: the first layer's running sum, (batch, hidden)."""
+        """Return the state before the first step: the first layer's sum (batch, hidden), 0."""
         return {"decoder_sum": self.bias.new_zeros(batch, len(self.bias))}
 
     def step(
         self, features: Tensor, index: Tensor, state: dict[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """features (batch, feature), index (batch,) int64 -> embedding (batch, unit), state
+        """Map features (batch, feature) of step `index` (batch,) to an embedding and a state.
 
-        Steps past the last weight change nothing.
+        Features of steps beyond the decoder's number of steps are ignored.
         """
         weight = self.weight[index.clamp(max=len(self.weight) - 1)]  # (batch, hidden, feature)
         product = torch.matmul(weight, features[:, :, None])[:, :, 0]  # (batch, hidden)
@@ -132,12 +132,12 @@ class MLPAllDecoder(nn.Module):
         return self._apply_rest(total), {"decoder_sum": total}
 
     def _apply_rest(self, total: Tensor) -> Tensor:
-        """The first layer's sum (..., hidden) -> embedding (..., unit)"""
+        """Map the first layer's sum (..., hidden) to the embedding (..., unit)."""
         return F.relu(self.layer2(F.relu(total + self.bias)))
 
 
 def hidden(width: float) -> tuple[int, int]:
-    """Return the sizes of the two hidden layers at a width."""
+    """Return the sizes of an MLP's two hidden layers, scaled by `width`."""
     wide, narrow = (round(units * width) for units in HIDDEN)
     return wide, narrow
 

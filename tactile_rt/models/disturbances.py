@@ -1,6 +1,6 @@
-"""Disturbances by a real sensor that simulated sweeps lack, to test a model with.
+"""Disturbances of a real sensor that simulated sweeps lack, for robustness tests of a model.
 
-The faults that training draws are those of `sensor_faults`.
+The faults that training draws are in `sets.sensor_faults`.
 """
 
 from collections.abc import Sequence
@@ -19,21 +19,21 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class Disturbance:
-    """Faults of the sensor, drawn anew for each sweep.
+    """Amounts of the sensor faults of a robustness test, drawn anew for each sweep.
 
     Attributes:
         noise: The white noise on every stored sample, in units of the rated noise; recorded sweeps
-            have one unit of it already, and only what is lacking is added.
+            already have one unit, and only the difference is added.
         gain: The standard deviation of every whisker's relative gain error.
         dead: The number of whiskers, drawn at random, that read zero throughout.
         rows: The number of rows of the grid, drawn at random, whose whiskers all read zero.
         offset: The size of a constant that appears with the contact, after the baseline, in units
             of `OFFSET`; a sign is drawn for every whisker and channel.
-        drift: The size that a linear drift from the contact on has reached at the window's end, in
-            units of `OFFSET`; a sign is drawn as for the offset.
-        swapped: True if the channels of x and of y are swapped.
-        rest: The number of stored samples of silence before each sweep, for the baseline; a robot
-            has them, simulated sweeps have only a short lead.
+        drift: The size at the window's end of a linear drift that begins at contact, in units of
+            `OFFSET`; a sign is drawn as for the offset.
+        swapped: True if the x and y channels are swapped.
+        rest: The number of zero samples put before each simulated sweep, for the baseline; a robot
+            rests for longer than the short lead of a simulated sweep.
 
     Raises:
         ConfigError: a negative amount.
@@ -50,14 +50,14 @@ class Disturbance:
 
     def __post_init__(self) -> None:
         for name in ("noise", "gain", "dead", "rows", "offset", "drift", "rest"):
-            if not getattr(self, name) >= 0:  # which NaN is not either
+            if not getattr(self, name) >= 0:  # also if it is NaN
                 raise ConfigError(f"{name} is {getattr(self, name)}, must not be negative")
 
     def disturb_samples(self, values: Floats, data: SweepSet, rng: np.random.Generator) -> Floats:
-        """Return sweeps as the contact detector receives them.
+        """Add rest, gain errors, dead whiskers, swapped channels and noise to sweeps.
 
         Args:
-            values: (sweep, sample, element, channel) of these sweeps, SI.
+            values: (sweep, sample, element, channel), SI, of the sweeps in `data`.
         """
         if self == CLEAN:
             return values
@@ -88,7 +88,7 @@ class Disturbance:
         return values
 
     def disturb_windows(self, samples: Floats, data: SweepSet, rng: np.random.Generator) -> Floats:
-        """Return windows (sweep, step, sub-step, element, channel), SI, with offset and drift."""
+        """Add offset and drift to windows (sweep, step, sub-step, element, channel), SI."""
         steps, substeps = samples.shape[1:3]
         course = np.arange(1, steps * substeps + 1, dtype=np.float32) / (steps * substeps)
         for amount, over_time in ((self.offset, np.ones_like(course)), (self.drift, course)):
@@ -106,7 +106,7 @@ RATED = Disturbance(noise=1.0)
 
 
 def _swap_x_and_y(channels: Sequence[str]) -> list[int]:
-    """Return the index of every channel after those ending in x and y are swapped."""
+    """Return channel indices in which names ending in x and y are swapped."""
     other = {"x": "y", "y": "x"}
     swapped = [name[:-1] + other.get(name[-1], name[-1]) for name in channels]
     return [channels.index(name if name in channels else channels[k])

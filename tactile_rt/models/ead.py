@@ -1,4 +1,4 @@
-"""Networks that classify what an array of whiskers touches, anew at every step.
+"""Encoder-attender-decoder networks that classify, at every step, the object an array touches.
 
     samples -> input stage -> frames -> encoder -> attender -> decoder -> logits
     (batch, step, channel, row, column) -> (batch, step, feature) -> (batch, step, class)
@@ -6,13 +6,13 @@
 The channels are those of all sub-steps of a step, rows and columns the array's grid: 5 sub-steps
 x 6 loads on 5 x 7 cells for the mouse's whiskers of the paper.
 
-The input stage is in the graph, so that units travel with it. Most whiskers feel micronewtons
-while one that jams feels newtons, so values are compressed as sign(v) log(1 + |v| / s). The scale
-s never falls below the noise measured at rest, or the logarithm would magnify silent channels into
-signals. A recurrent network would never forget a NaN: so a sample that is NaN or infinite counts
-as no load, as does a channel with such a baseline or noise; this is in the graph of exported files
+The input stage is part of the graph, so that an exported network takes SI units. Most whiskers
+measure micronewtons, a jammed one newtons, so values are compressed as sign(v) log(1 + |v| / s).
+The scale s never falls below the noise measured at rest, or the logarithm would magnify silent
+channels into signals. A recurrent network would never forget a NaN, so a sample that is NaN or
+infinite counts as zero load, as does a channel with such a baseline or noise, in exported files
 too. The paper's own preprocessing ("paper") has no logarithm: forces in mN and moments in
-uN m as they are, limited to 1000 of either (Chung et al. 2025, and its code).
+uN m, each limited to a magnitude of 1000 (Chung et al. 2025, and its code).
 
 `EAD.forward` takes a whole window for training; `EAD.step` takes one frame and explicit state,
 for streaming, and gives the same logits. The logits of a step use no later frame.
@@ -42,10 +42,10 @@ GPT_OF_RESNET = 256  # the paper's GPT is narrower than its features there, and 
 
 
 class TactileClassifier(nn.Module):
-    """The input stage and the network in one, from samples in SI units to logits.
+    """Classifier of samples in SI units: the input stage and the network in one module.
 
     Args:
-        limits: clip and scale of the channels.
+        limits: clip and scale of each channel, SI; not used by the preprocessing "paper".
 
     Raises:
         ConfigError: the network is for another array, or its preprocessing for other units.
@@ -70,29 +70,29 @@ class TactileClassifier(nn.Module):
 
     @property
     def timing(self) -> Timing:
-        """Numbers of steps and sub-steps in its windows."""
+        """Numbers of steps and sub-steps in an input window."""
         config = self.network.config
         return Timing(config.max_steps, config.frame[0] // len(self.inputs.clip))
 
     def forward(self, samples: Tensor, offset: Tensor, sigma: Tensor) -> Tensor:
-        """(batch, step, sub-step, element, channel) SI -> logits (batch, step, class)"""
+        """Map samples (batch, step, sub-step, element, channel) to logits (batch, step, class)."""
         logits: Tensor = self.network(self.inputs(samples, offset, sigma))
         return logits
 
     def features(self, frames: Tensor) -> Tensor:
-        """(batch, step, channel, row, column) -> (batch, step, feature): encoder and attender."""
+        """Map frames (batch, step, channel, row, column) to features (batch, step, feature)."""
         return self.network.features(frames)
 
 
 class InputStage(nn.Module):
-    """Raw samples in SI units (N, N m) to network frames.
+    """Input layer that maps samples in SI units to frames on the array's grid.
 
     Args:
         positions: grid (row, column) of each element, in the order of the samples.
         shape: rows and columns of the grid; cells without an element are zero.
-        clip: per channel, the largest magnitude that is believed (channel,), SI.
-        scale: per channel, the floor of the logarithm's scale (channel,), SI; without a logarithm,
-            the unit.
+        clip: (channel,) largest magnitude, SI; larger loads are clipped to it.
+        scale: (channel,) smallest scale s of the logarithm, SI; without a logarithm, the unit that
+            loads are divided by.
         preprocessing: one of `ead_config.PREPROCESSINGS`.
 
     Raises:
@@ -136,7 +136,7 @@ class InputStage(nn.Module):
         self.register_buffer("element", element.flatten())
 
     def forward(self, samples: Tensor, offset: Tensor, sigma: Tensor) -> Tensor:
-        """Return frames, sub-step-major: all channels of the first sub-step, then the second, ...
+        """Map samples to frames, whose channels are those of the first sub-step, then the second.
 
         samples         (batch, ..., sub-step, element, channel)  SI
         offset, sigma   (batch, element, channel)                 SI: mean and noise at rest
@@ -168,7 +168,7 @@ class InputStage(nn.Module):
 
 
 def paper_units(spec: ArraySpec) -> tuple[list[float], list[float]]:
-    """Return clip and unit of each channel (channel,), SI, of the preprocessing "paper".
+    """Return the clip and the unit (channel,), SI, of the preprocessing "paper".
 
     Raises:
         ConfigError: a channel that is neither a force nor a moment.
@@ -183,12 +183,12 @@ def paper_units(spec: ArraySpec) -> tuple[list[float], list[float]]:
 
 
 class EAD(nn.Module):
-    """The network of one `EADConfig`; see the module's docstring.
+    """Encoder-attender-decoder network, built from an `EADConfig`, from frames to logits.
 
     Attributes:
-        feature_size: The number of features of a step, which the decoder reads.
-        lag: The number of steps that a frame takes to reach the logits: the first `lag` steps of a
-            window depend on no frame, the last `lag` frames have no effect.
+        feature_size: The number of features in a step, the decoder's input.
+        lag: The delay in steps from a frame to the logits: the first `lag` logits of a window
+            depend on no frame, and its last `lag` frames have no effect.
     """
 
     def __init__(self, config: EADConfig) -> None:
@@ -217,23 +217,23 @@ class EAD(nn.Module):
         self.decoder = kind(width, config.outputs, config.width, config.max_steps)
 
     def features(self, frames: Tensor) -> Tensor:
-        """Run encoder and attender; return the decoder's input, features (batch, step, feature)."""
+        """Map frames to the decoder's input, features (batch, step, feature)."""
         frames = F.pad(frames, (0, 1)) if self._needs_silent_cell else frames
         features: Tensor = self.attender(self.encoder(frames))
         return features
 
     def embed(self, frames: Tensor) -> Tensor:
-        """Embed frames, (batch, step, unit), as `step_outputs` does in each step."""
+        """Map frames to embeddings (batch, step, unit), the same as `step_outputs` returns."""
         if self.config.identity:
             return self.split(self.answer(frames))["embedding"]
         return self.decoder.embed(self.features(frames))
 
     def forward(self, frames: Tensor) -> Tensor:
-        """frames (batch, step, channel, row, column) -> logits (batch, step, class)"""
+        """Map frames (batch, step, channel, row, column) to logits (batch, step, class)."""
         return self.answer(frames)[..., : self.config.classes]
 
     def split(self, answers: Tensor) -> dict[str, Tensor]:
-        """Split answers (..., output) into logits, names and an embedding of length 1, if any."""
+        """Split outputs (..., output) into logits and, if any, names and a unit-norm embedding."""
         classes, names = self.config.classes, self.config.classes + self.config.names
         out = {"logits": answers[..., :classes]}
         if self.config.identity:
@@ -243,7 +243,7 @@ class EAD(nn.Module):
         return out
 
     def answer(self, frames: Tensor) -> Tensor:
-        """Return all outputs of the last layer for frames, (batch, step, output)."""
+        """Map frames to all outputs (batch, step, output); running means with readout "mean"."""
         logits: Tensor = self.decoder(self.features(frames))
         if self.config.readout == "last":
             return logits
@@ -254,7 +254,7 @@ class EAD(nn.Module):
         return torch.cat([logits[:, : self.lag], total / counts[:, None]], dim=1)
 
     def initial_state(self, batch: int) -> dict[str, Tensor]:
-        """Return the state before the first step, in order: zeros with a leading batch axis."""
+        """Return the state before the first step: named zero tensors (batch, ...), in order."""
         weight = next(self.parameters())
         state = {
             "index": torch.zeros(batch, dtype=torch.int64, device=weight.device),
@@ -269,7 +269,7 @@ class EAD(nn.Module):
     def step(self, frame: Tensor, state: dict[str, Tensor]) -> tuple[Tensor, dict[str, Tensor]]:
         """Map a frame (batch, channel, row, column) to logits (batch, class) and the next state.
 
-        To reset a lane, put its rows of `initial_state` back.
+        To reset one stream of the batch, set its rows of the state to those of `initial_state`.
         """
         outputs, new = self.step_outputs(frame, state)
         return outputs["logits"], new
@@ -277,10 +277,10 @@ class EAD(nn.Module):
     def step_outputs(
         self, frame: Tensor, state: dict[str, Tensor]
     ) -> tuple[dict[str, Tensor], dict[str, Tensor]]:
-        """Run `step` and return all outputs: `logits`, `embedding` and maybe `names`.
+        """Map a frame to `logits`, `embedding` and, if configured, `names`, and the next state.
 
-        The embedding (batch, unit) is what the last layer reads in this step alone, even if the
-        logits are a mean over steps; an embedding trained on identity is such a mean too.
+        The embedding (batch, unit) is the last layer's input in this step alone, even if the
+        logits are a mean over steps; an embedding trained on identity is averaged as well.
         """
         index = state["index"]
         frame = F.pad(frame, (0, 1)) if self._needs_silent_cell else frame
@@ -312,10 +312,10 @@ def _build_encoder(config: EADConfig) -> Any:
 
 
 def _needs_silent_cell(config: EADConfig) -> bool:
-    """Return whether a single cell gets a silent one beside it: convolutions need a map."""
+    """Return whether a one-cell grid must be padded by a zero cell for the convolutions."""
     return config.encoder.startswith("zhuang-") and config.frame[1:] == (1, 1)
 
 
 def count_parameters(module: nn.Module) -> int:
-    """Count the numbers in a module's parameters, without buffers."""
+    """Return the number of scalar parameters in a module, without buffers."""
     return sum(parameter.numel() for parameter in module.parameters())

@@ -1,4 +1,4 @@
-"""The configuration of a network, and the names of its possible parts. Needs no torch."""
+"""The configuration of a network, and the names of available parts. Needs no torch."""
 
 import math
 from dataclasses import dataclass
@@ -34,45 +34,45 @@ WIDEST = 4  # sixteen times the paper's parameters, a billion
 
 
 def added_cells() -> tuple[str, ...]:
-    """List the cells that other packages add, each plain and, with "-ln", normalised."""
+    """List the recurrent cells that plugins add, each without and with layer norm ("-ln")."""
     return tuple(f"{cell}{ln}" for cell in packages.added_names(packages.CELLS) for ln in LN)
 
 
 def encoder_class(name: str) -> tuple[str, str]:
-    """Return the module in `encoders`, and the class or function in it, of an encoder."""
+    """Return an encoder's module in `encoders` and its class or function in that module."""
     return ENCODERS.get(name, ZHUANG)
 
 
 def _list_encoders(asked: str) -> tuple[str, ...]:
-    """List all encoders, those of other packages only if `asked` is none of ours."""
+    """List our encoders, and those of plugins as well if `asked` is none of ours."""
     ours = tuple(ENCODERS)
     return ours if asked in ours else (*ours, *(f"zhuang-{cell}" for cell in added_cells()))
 
 
 @dataclass(frozen=True)
 class EADConfig:
-    """A network; the defaults are the paper's Intersection-LN + GPT, 63.8 M parameters."""
+    """Options of a network; defaults: the paper's Intersection-LN + GPT, 63.8 M parameters."""
 
     classes: int
     encoder: str = "zhuang-intersection-ln"
     attender: str = "gpt"
     decoder: str = "linear"
     width: float = 1.0  # scales every channel count; the GPT's heads and layers stay
-    # "last": a step's own logits (the paper). "mean": their running mean since the first frame
-    # could count, for a decision at any time.
+    # "last": a step's own logits (the paper). "mean": their running mean from step `lag` on, for a
+    # decision at any time.
     readout: str = "last"
     dropout: float = 0.1
     max_steps: int = 22  # of an episode; the GPT has no further positions
     graph: str = ""  # of encoder "graph": the text of a TOML file, see `encoders.graph`
     frame: tuple[int, int, int] = MOUSE_FRAME  # channels, rows and columns of its input
     norm_epsilon: float = 0.0  # of the cells' layer norms; 0: each cell's own, see `cells`
-    preprocessing: str = "log"  # of the input stage, see `inputs`
+    preprocessing: str = "log"  # of the input stage, see `ead`
     names: int = 0  # kinds within the classes, with logits beside those of the classes
     identity: int = 0  # units of an embedding that is trained to distinguish objects; 0: none
 
     @property
     def outputs(self) -> int:
-        """Rows of the last layer: logits of classes, those of names, the embedding."""
+        """Number of outputs: logits of the classes and of the names, units of the embedding."""
         return self.classes + self.names + self.identity
 
     def __post_init__(self) -> None:

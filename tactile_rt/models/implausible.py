@@ -1,7 +1,7 @@
-"""Loads that no touch makes: a sensor wired the wrong way, or half of it gone.
+"""Implausible loads, which no touch produces: a sensor wired wrongly, or half of it missing.
 
-A network should classify in spite of `sensor_faults`; the faults here it should name, since such
-loads allow no answer about the object. Training makes them out of sound sweeps.
+A network should classify in spite of the faults in `sensor_faults`. The faults here it should
+name, since such loads say nothing about the object. Training makes them out of sound sweeps.
 """
 
 from collections.abc import Callable
@@ -14,13 +14,13 @@ from tactile_rt.core.stream import ArraySpec
 Samples = NDArray[np.float32]  # (sweep, ..., element, channel), SI
 
 AXES = "xyz"
-GAINS = (2.5, 5.0)  # too large, or too small, by a factor between these
+GAINS = (2.5, 5.0)  # range of the factor by which loads are too large or too small
 MISSING = (0.45, 0.7)  # of the elements
-FEWEST = 4  # elements from which on half of them can be missing
+FEWEST = 4  # smallest array in which half of the elements can be missing
 
 
 def _swap_axes(samples: Samples, spec: ArraySpec, rng: np.random.Generator) -> Samples:
-    """Swap two axes, of all vectors or of one."""
+    """Swap two random axes in each sweep, of the force, the moment or both."""
     vectors = _find_vectors(spec)
     out = samples.copy()
     for k in range(len(out)):
@@ -31,7 +31,7 @@ def _swap_axes(samples: Samples, spec: ArraySpec, rng: np.random.Generator) -> S
 
 
 def _invert_axes(samples: Samples, spec: ArraySpec, rng: np.random.Generator) -> Samples:
-    """Invert the sign of one axis or more, of all vectors or of one."""
+    """Invert random axes in each sweep, of the force, the moment or both."""
     vectors = _find_vectors(spec) or [tuple(range(len(spec.channels)))]
     out = samples.copy()
     for k in range(len(out)):
@@ -42,7 +42,7 @@ def _invert_axes(samples: Samples, spec: ArraySpec, rng: np.random.Generator) ->
 
 
 def _scale_loads(samples: Samples, spec: ArraySpec, rng: np.random.Generator) -> Samples:
-    """Make all loads several times too large or too small."""
+    """Multiply or divide the loads of each sweep by a random factor within `GAINS`."""
     n, (least, most) = len(samples), np.log(GAINS)
     factor = np.exp(rng.uniform(least, most, n) * rng.choice([-1, 1], n))
     each = factor.reshape(-1, *(1,) * (samples.ndim - 1))
@@ -51,7 +51,7 @@ def _scale_loads(samples: Samples, spec: ArraySpec, rng: np.random.Generator) ->
 
 
 def _silence_half(samples: Samples, spec: ArraySpec, rng: np.random.Generator) -> Samples:
-    """Set about half of the elements to zero: random ones, or those of one side."""
+    """Set about half of each sweep's elements to zero, at random or on one side."""
     elements = len(spec.elements)
     grid = np.array(spec.grid, dtype=np.float64)
     alive = np.ones((len(samples), elements))
@@ -71,7 +71,7 @@ IMPLAUSIBLE: dict[str, Callable[[Samples, ArraySpec, np.random.Generator], Sampl
 
 
 def implausible(spec: ArraySpec) -> tuple[str, ...]:
-    """Return the names of the faults that an array can have."""
+    """Return the names of the implausible faults that are possible for an array."""
     possible = {
         "swapped channels": bool(_find_vectors(spec)),
         "missing elements": len(spec.elements) >= FEWEST,
@@ -80,7 +80,7 @@ def implausible(spec: ArraySpec) -> tuple[str, ...]:
 
 
 def _find_vectors(spec: ArraySpec) -> list[tuple[int, ...]]:
-    """Return the channel indices (x, y, z) of each vector: force and moment."""
+    """Return channel indices (x, y, z) of each vector among the channels, such as force."""
     names = list(spec.channels)
     stems = dict.fromkeys(name[:-1] for name in names if name[-1] in AXES)
     whole = [stem for stem in stems if all(stem + axis in names for axis in AXES)]
@@ -90,5 +90,5 @@ def _find_vectors(spec: ArraySpec) -> list[tuple[int, ...]]:
 def _pick_vectors(
     vectors: list[tuple[int, ...]], rng: np.random.Generator
 ) -> list[tuple[int, ...]]:
-    """Return all vectors, or with probability one half a random one of them."""
+    """Return all vectors or, with probability 1/2, a random one."""
     return vectors if rng.random() < 0.5 else [vectors[rng.integers(len(vectors))]]

@@ -1,7 +1,7 @@
-"""The contact detector over many stored sweeps at once, with the numbers of `ContactDetector`.
+"""The contact detector vectorised over stored sweeps, with the results of `ContactDetector`.
 
-The detector takes one sample of one stream; here each step takes one sample of every sweep, which
-is several times faster. Tests check that both agree.
+`ContactDetector` reads one sample of one stream; here each iteration reads one sample of every
+sweep, which is several times faster. Tests check that both agree.
 """
 
 from dataclasses import dataclass
@@ -16,11 +16,11 @@ BATCH = 128  # sweeps at a time: their histories should stay in the cache
 
 @dataclass(frozen=True)
 class Onsets:
-    """The onset of contact in every sweep, and the baseline there.
+    """The onset of contact in every sweep, and the baseline at that time.
 
     Attributes:
-        start: (sweep,) sample of onset; -1 where none was found.
-        offset, sigma: (sweep, element, channel) baseline and noise, SI.
+        start: (sweep,) The sample of onset; -1 where none was found.
+        offset, sigma: (sweep, element, channel) The mean and noise of the baseline, SI.
     """
 
     start: NDArray[np.int64]
@@ -29,7 +29,7 @@ class Onsets:
 
 
 def find_onsets(values: NDArray[np.float32], floor: NDArray[np.float32]) -> Onsets:
-    """Run the contact detector over sweeps, every element trusted.
+    """Detect the onset of contact in every sweep, with all elements in use.
 
     Args:
         values: (sweep, sample, element, channel), noise included, SI.
@@ -90,15 +90,15 @@ def _detect(
 
 
 class _Baseline:
-    """The baseline of every sweep, and the samples that wait to enter it."""
+    """Running baselines of all sweeps, each with a queue of samples to add."""
 
     def __init__(self, values: NDArray[np.float32], floor: NDArray[np.float32]) -> None:
         n, samples, *rest = values.shape
         shape = (n, *rest)
         self.values, self.floor = values, floor
-        self.order = np.zeros((samples, n), dtype=np.int64)  # quiet samples as they came
-        self.came = np.zeros(n, dtype=np.int64)  # how many of them
-        self.count = np.zeros(n, dtype=np.int64)  # how many of those have entered
+        self.order = np.zeros((samples, n), dtype=np.int64)  # indices of the quiet samples
+        self.came = np.zeros(n, dtype=np.int64)  # number of quiet samples so far
+        self.count = np.zeros(n, dtype=np.int64)  # number of samples added to the baseline
         self.total, self.squares = np.zeros(shape), np.zeros(shape)
         self.offset = np.zeros(shape, dtype=np.float32)
         self.sigma = np.broadcast_to(floor, shape).astype(np.float32)
@@ -109,7 +109,7 @@ class _Baseline:
         self.came[of] += 1
 
     def learn(self, of: NDArray[np.int64], guard: NDArray[np.int64]) -> None:
-        """Let all but the latest `guard` (len(of),) waiting samples enter the baseline."""
+        """Add the queued samples of sweeps `of` to their baselines, except the last `guard`."""
         changed = of[self.came[of] - self.count[of] > guard]
         while len(of):
             more = self.came[of] - self.count[of] > guard

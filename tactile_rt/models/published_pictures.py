@@ -1,9 +1,9 @@
 """The control augmentations of the paper's code, which treat touches as pictures.
 
-Forces are the three colours of a picture of the array, moments those of another, and the usual
+Forces are the three colours of one picture of the array, moments those of a second. The usual
 operations on photographs follow: mirrored, colours jittered, greyscale, blurred (Chen et al. 2020).
-As those operations take colours from 0 to 1, loads are clipped to that: the paper's code does so
-too. One draw is for a whole batch.
+These operations take colours from 0 to 1, so loads are clipped to that range, as in the paper's
+code. There is one random draw for a whole batch.
 
 Source: SimCLRTransform and SimSiamTransform of the published code (neuroagents-lab,
 2025-tactile-whisking), whose operations are torchvision's on tensors of floats.
@@ -29,8 +29,8 @@ class Jitter:
     """The strength of a colour jitter.
 
     Attributes:
-        strength: The largest change of brightness, contrast and saturation, as a factor from 1.
-        hue: The largest change of the hue, in turns of the colour circle.
+        strength: The largest deviation from 1 of the factors of brightness, contrast, saturation.
+        hue: The largest change of the hue, as a fraction of the colour circle.
     """
 
     strength: float
@@ -42,12 +42,12 @@ JITTERS = {"image-paper": Jitter(0.8, 0.2), "image-paper-weak": Jitter(0.4, 0.1)
 
 @dataclass(frozen=True)
 class Draw:
-    """The drawn operations on a batch.
+    """Random parameters of the augmentation of one batch.
 
     Attributes:
-        order: The order in which brightness, contrast, saturation and hue are changed, by their
-            numbers from 0; empty: they stay.
-        by: The factors of the first three, and the turns that are added to the hue.
+        order: The order of changes to brightness (0), contrast (1), saturation (2) and hue (3);
+            empty: no change.
+        by: The factors of the first three, and the fraction of a circle added to the hue.
         sigma: The width of the blur, in cells; 0: none.
     """
 
@@ -59,7 +59,7 @@ class Draw:
 
 
 def augment(frames: Tensor, generator: Generator, jitter: Jitter) -> Tensor:
-    """Augment frames with one draw for the batch.
+    """Augment frames by mirroring, colour jitter, greyscale and blur, drawn once for the batch.
 
     Args:
         frames: (batch, step, sub-step * channel, row, column); channels in threes are colours.
@@ -84,7 +84,7 @@ def augment(frames: Tensor, generator: Generator, jitter: Jitter) -> Tensor:
 
 
 def as_drawn(frames: Tensor, done: Draw) -> Tensor:
-    """Apply drawn operations to frames (batch, step, sub-step * channel, row, column)."""
+    """Augment frames (batch, step, sub-step * channel, row, column) by given parameters."""
     x = frames.unflatten(2, (-1, COLOURS))  # (batch, step, picture, colour, row, column)
     if done.mirrored:
         x = x.flip(-1)
@@ -121,7 +121,7 @@ def grey(x: Tensor) -> Tensor:
 
 
 def with_hue(x: Tensor, by: float) -> Tensor:
-    """Return pictures (..., colour, row, column) with `by` turns added to their hue."""
+    """Shift the hue of pictures (..., colour, row, column) by a fraction of its circle."""
     red, green, _ = x.unbind(-3)
     value, least = x.amax(-3), x.amin(-3)
     span, none = value - least, value == least
@@ -142,7 +142,7 @@ def with_hue(x: Tensor, by: float) -> Tensor:
 
 
 def blur_pictures(x: Tensor, sigma: float) -> Tensor:
-    """Blur pictures (..., row, column) by a 3 x 3 Gaussian, mirrored at the edge."""
+    """Blur pictures (..., row, column) by a 3 x 3 Gaussian; mirror cells at edges."""
     at = torch.arange(-1.0, 2.0)
     kernel = torch.exp(-0.5 * (at / sigma) ** 2).to(x)
     kernel = kernel / kernel.sum()

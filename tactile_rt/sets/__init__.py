@@ -1,1 +1,1 @@
-"""Sweep sets on disk: simulated or cut out of recordings, and read by training."""
+"""Sweep sets on disk, simulated or cut out of recordings, as training reads them."""

@@ -1,10 +1,10 @@
 """The manifest of a sweep set: its array, period, categories, and the split of its objects.
 
 sets/default24/
-    manifest.json      what the set is: array, period, categories, split by object, recipe
-    mug-17.npz         every sweep of one object
+    manifest.json      the description: array, period, categories, split by object, recipe
+    mug-17.npz         all sweeps of one object
     skipped.json       objects that could not be made, and why
-    SHA256SUMS         of all these, once the set is finished: `sha256sum -c` reads it too
+    SHA256SUMS         checksums of these files once the set is finished, for `sha256sum -c`
 """
 
 from collections.abc import Sequence
@@ -21,38 +21,38 @@ from tactile_rt.core.stream.sensor_spec import ChannelLimits, SensorSpec, channe
 from tactile_rt.sets.sensor_faults import SensorFaults
 
 SET_VERSION = 2
-RECORDED_VERSION = 3  # of recordings: a reader of version 2 alone would add their noise again
+RECORDED_VERSION = 3  # of recorded sweeps: a reader of version 2 would add noise to their own
 READABLE = (SET_VERSION, RECORDED_VERSION)
 MANIFEST, SKIPPED = "manifest.json", "skipped.json"
-CONTACTS = "contacts"  # in an object's file, and in the recipe that asks for them
-FAULTS = "faults"  # in the recipe, see `sensor_faults`
-RECORDINGS = "recordings"  # in the recipe of a set that is made of them
+CONTACTS = "contacts"  # key in an object's file, and in a recipe that requests contacts
+FAULTS = "faults"  # key in the recipe, see `sensor_faults`
+RECORDINGS = "recordings"  # key in the recipe of a set that is cut out of recordings
 UNLABELLED = "unlabelled"  # the category of touches without a label
 SPLITS = ("train", "validation", "test")
-# Further splits, of categories that are labelled -1: training never sees the first, and may learn
-# from the second what to refuse.
+# Further splits, of categories with label -1: training never reads the withheld ones, and may learn
+# to refuse the outliers.
 WITHHELD, OUTLIERS = "withheld", "outliers"
-# Sweeps of training objects that no training learns from, where the recipe holds some out.
+# The split of the sweeps of training objects that the recipe holds out from training.
 NEW_SWEEPS = "new-sweeps"
 
 
 @dataclass(frozen=True)
 class SweepManifest:
-    """The description of a sweep set.
+    """The description of a sweep set, stored as its `manifest.json`.
 
     Attributes:
         period_ns: The sample period of the stored arrays, ns.
         lead: The number of samples at the start of every sweep before the object can touch.
-        categories: The names of the classes; a label is an index into them.
-        split: The object names of each split, each ``category-index`` unless `category_of` has it.
-        recipe: What made the set (profile, seed, sweeps per object ...), for provenance.
+        categories: The names of the classes; a label is an index into this list.
+        split: The object names of each split: ``category-index``, or any name in `category_of`.
+        recipe: The options that the set was made with (profile, seed, sweeps per object ...).
         withheld: The categories of the splits "withheld" and "outliers".
-        category_of: The category of each object whose name does not give it.
-        kind_of: The kind of objects that have one within their category: box, within block.
-        versions: The versions of what made the set (mujoco, numpy, ...).
-        sensor: The description of the array's sensor; None: it has none, and the values are base
-            loads.
-        version: The version of the set's format: 2 of simulated sweeps, 3 of recorded ones.
+        category_of: The category of each object whose name is not ``category-index``.
+        kind_of: The kind, such as box within block, of each object that has a kind.
+        versions: The versions of the software that made the set (mujoco, numpy, ...).
+        sensor: The description of the array's sensor; None: no sensor model, and the values are
+            loads at the elements' bases.
+        version: The version of the set's format: 2 for simulated sweeps, 3 for recorded sweeps.
     """
 
     spec: ArraySpec
@@ -71,7 +71,7 @@ class SweepManifest:
 
     @property
     def faults(self) -> SensorFaults:
-        """The sensor faults that training draws.
+        """Amounts of the sensor faults that training draws, from the recipe.
 
         Raises:
             RecordingError: the recipe's faults are invalid.
@@ -83,18 +83,18 @@ class SweepManifest:
 
     @property
     def source(self) -> str:
-        """The source of the objects according to the recipe; "" if it has none."""
+        """Source of the objects according to the recipe; "" if the recipe names no source."""
         objects = self.recipe.get("objects")
         return str(objects.get("from", "")) if isinstance(objects, dict) else ""
 
     @property
     def recorded(self) -> bool:
-        """True if its sweeps were recorded, with their sensor's noise, rather than simulated."""
+        """True if the sweeps were recorded, and so contain sensor noise, rather than simulated."""
         return RECORDINGS in self.recipe
 
     @property
     def frame(self) -> tuple[int, int, int]:
-        """Channels, rows and columns of a network's input in a step."""
+        """Channels, rows and columns of a network's input frame in one step."""
         rows, columns = self.spec.grid_shape
         return Timing.of(self.period_ns).substeps * len(self.spec.channels), rows, columns
 
@@ -105,7 +105,7 @@ class SweepManifest:
 
     @property
     def kinds(self) -> dict[str, tuple[str, ...]]:
-        """The kinds of each category that its training objects have."""
+        """Kinds of the training objects, by category; categories without kinds are left out."""
         found: dict[str, set[str]] = {}
         for name in self.split["train"]:
             if kind := self.kind_of.get(name):
@@ -113,10 +113,10 @@ class SweepManifest:
         return {c: tuple(sorted(found[c])) for c in self.categories if c in found}
 
     def names(self, splits: Sequence[str] = ()) -> list[str]:
-        """List the object names of these splits, or of all.
+        """List the object names of the given splits; without splits, of all.
 
         Raises:
-            ConfigError: no such split.
+            ConfigError: the set has no such split.
         """
         for split in splits:
             if split not in self.split:
@@ -127,7 +127,7 @@ class SweepManifest:
         """Return the category of an object.
 
         Raises:
-            RecordingError: the set does not name its category.
+            RecordingError: the manifest does not list the object's category.
         """
         category = self.category_of.get(name) or name.rpartition("-")[0]
         if category not in self.categories and category not in self.withheld:
@@ -135,12 +135,12 @@ class SweepManifest:
         return category
 
     def label(self, name: str) -> int:
-        """Return the label of an object: -1 if its category is withheld from training."""
+        """Return an object's label: the index of its category, -1 if not in `categories`."""
         category = self.category(name)
         return self.categories.index(category) if category in self.categories else -1
 
     def write(self, folder: Path) -> None:
-        """Write into a folder, or check that the folder already holds this set.
+        """Write the manifest into a folder, or check that the folder already holds this set.
 
         Raises:
             ConfigError: the folder holds another set, or other files.
@@ -156,7 +156,7 @@ class SweepManifest:
                 )
         text = msgspec.json.encode(self)
         if path.exists():
-            # Compared as JSON, which has no tuples: this recipe may have some.
+            # Compared as decoded JSON, which has no tuples: this recipe may contain tuples.
             here = msgspec.json.decode(text)
             there = msgspec.json.decode(msgspec.json.encode(SweepManifest.read(folder)))
             differing = _compare_recipes(here, there)
@@ -170,10 +170,10 @@ class SweepManifest:
 
     @classmethod
     def read(cls, folder: Path) -> "SweepManifest":
-        """Read a set's manifest.
+        """Read the manifest of the sweep set in a folder.
 
         Raises:
-            RecordingError: it is missing, damaged, or of another version.
+            RecordingError: the manifest is missing, damaged, or of an unknown version.
         """
         path = folder / MANIFEST
         try:
@@ -194,17 +194,17 @@ class SweepManifest:
 
 
 def object_path(folder: Path, name: str) -> Path:
-    """Return the path of the file of one object's sweeps."""
+    """Return the path of the file that stores one object's sweeps."""
     return folder / f"{name}.npz"
 
 
 def has_object(folder: Path, name: str) -> bool:
-    """Return whether the file of an object's sweeps, written whole or not at all, exists."""
+    """Return whether a set has an object's file, which is complete if it exists."""
     return object_path(folder, name).exists()
 
 
 def _compare_recipes(here: dict[str, Any], there: dict[str, Any], prefix: str = "") -> list[str]:
-    """List the keys that differ, those of nested tables by their full name."""
+    """List the keys whose values differ between two manifests, such as "recipe.seed"."""
     found = []
     for key in dict.fromkeys([*here, *there]):
         mine, theirs = here.get(key), there.get(key)

@@ -1,7 +1,7 @@
-"""The sweeps of a set's objects on disk: one file per object, written whole or not at all.
+"""The sweeps of a set's objects on disk: one file per object, written atomically.
 
-So no half-written file is ever read, and a split cannot divide an object. The archive's own
-checksums reveal a damaged file at every reading.
+So a reader never sees a partly written file, and a split cannot divide an object. The archive's
+checksums reveal a damaged file whenever it is read.
 """
 
 import zipfile
@@ -28,16 +28,16 @@ from tactile_rt.sets.manifest import (
 
 @dataclass(frozen=True)
 class Sweeps:
-    """Sweeps in memory.
+    """Sweeps in memory, with their labels and object names.
 
     Attributes:
-        values: The (sweep, sample, element, channel) float32 loads, SI, on the set's period.
-        labels: The (sweep,) int64 index into the manifest's categories; -1: of none of them.
-        objects: The (sweep,) names of the objects; sweeps of one object share the name.
-        contacts: The (sweep, sample, element) float32 arc length (m) from the whisker's base to
-            where it touches, NaN where it does not; None: the set has none.
-        recorded: The (sweep,) bool: True if a sweep was recorded, and so has its sensor's noise;
-            None: all were simulated, without noise.
+        values: (sweep, sample, element, channel) float32 The loads, SI, at the set's period.
+        labels: (sweep,) int64 The index of the category in the manifest; -1: not a category.
+        objects: (sweep,) The names of the objects; sweeps of one object share the name.
+        contacts: (sweep, sample, element) float32 The arc length (m) from the whisker's base to
+            the contact, NaN without contact; None: the set stores no contacts.
+        recorded: (sweep,) bool True if a sweep was recorded, and so contains sensor noise;
+            None: all sweeps were simulated, without noise.
     """
 
     values: NDArray[np.float32]
@@ -63,13 +63,13 @@ def write_object(
     parameters: dict[str, NDArray[Any]],
     contacts: NDArray[np.float32] | None = None,
 ) -> None:
-    """Write all sweeps of one object, whole or not at all.
+    """Write all sweeps of one object to its file, atomically.
 
     Args:
-        name: ``category-index``.
-        values: (sweep, sample, element, channel) SI.
-        parameters: (sweep,) arrays that describe each sweep, stored beside the values.
-        contacts: (sweep, sample, element), see `Sweeps`; None stores none.
+        name: the object's name, ``category-index``.
+        values: (sweep, sample, element, channel), SI.
+        parameters: named arrays (sweep,) that describe the sweeps, stored with the values.
+        contacts: (sweep, sample, element), see `Sweeps`; None: no contacts are stored.
     """
     arrays: dict[str, Any] = {"values": values.astype(np.float32), **parameters}
     if contacts is not None:
@@ -78,18 +78,18 @@ def write_object(
 
 
 def read_sweeps(folder: Path, split: str) -> Sweeps:
-    """Read all sweeps of one split, without those of skipped objects.
+    """Read all sweeps of one split; skipped objects are left out.
 
     Raises:
-        RecordingError: no such set, or an object is missing (the run that makes it was
-            interrupted) or damaged.
-        ConfigError: no such split.
+        RecordingError: the set is missing, or an object is damaged or missing (the run that makes
+            the set was interrupted).
+        ConfigError: the set has no such split.
     """
     return read_split(folder, SweepManifest.read(folder), split)
 
 
 def read_split(folder: Path, manifest: SweepManifest, split: str) -> Sweeps:
-    """Read one split of a set whose manifest is known, as `read_sweeps` does."""
+    """Read all sweeps of one split as `read_sweeps` does, given the set's manifest."""
     names = _list_objects(folder, manifest, "train" if split == NEW_SWEEPS else split)
     labels = [manifest.label(name) for name in names]
     missing = [name for name in names if not has_object(folder, name)]
@@ -138,7 +138,7 @@ def read_split(folder: Path, manifest: SweepManifest, split: str) -> Sweeps:
 
 
 def holds_out_sweeps(manifest: SweepManifest) -> bool:
-    """Return whether a set's recipe holds out sweeps of its training objects."""
+    """Return whether a set's recipe excludes sweeps of training objects from training."""
     recipe = manifest.recipe.get("sweeps", {})
     return bool(recipe.get("held_out_draws") or recipe.get("held_out"))
 
@@ -146,10 +146,10 @@ def holds_out_sweeps(manifest: SweepManifest) -> bool:
 def _choose_sweeps(
     path: Path, manifest: SweepManifest, split: str, sweeps: int
 ) -> NDArray[np.bool_]:
-    """Choose which sweeps of an object belong to a split, (sweep,).
+    """Return a mask (sweep,) of the sweeps of an object that belong to a split.
 
-    Of training objects the draws beyond the recipe's own are held out, or as many as it says, drawn
-    for each object.
+    Of a training object either the draws from number `draws` on are held out, or `held_out` random
+    sweeps, as the recipe says.
     """
     chosen = np.ones(sweeps, dtype=np.bool_)
     if split not in ("train", NEW_SWEEPS) or not holds_out_sweeps(manifest):
@@ -167,11 +167,11 @@ def _choose_sweeps(
 
 
 def read_object(folder: Path, name: str) -> tuple[NDArray[np.float32], dict[str, NDArray[Any]]]:
-    """Read all sweeps of one object.
+    """Read all sweeps of one object, without contacts (`read_sweeps` reads these).
 
     Returns:
-        (sweep, sample, element, channel) values, SI, and the (sweep,) arrays that describe each.
-        Contacts are left out; `read_sweeps` reads them.
+        Values (sweep, sample, element, channel), SI, and named arrays (sweep,) that describe the
+        sweeps.
 
     Raises:
         RecordingError: the file is damaged.
@@ -195,7 +195,7 @@ def _list_objects(folder: Path, manifest: SweepManifest, split: str) -> list[str
 
 
 def _read_shape(path: Path, shape: tuple[int, int]) -> tuple[int, ...]:
-    """Read the shape of an object's values, without the values."""
+    """Read the shape of an object's values without loading the values, and check it."""
     try:
         with zipfile.ZipFile(path) as archive, archive.open("values.npy") as member:
             version = np.lib.format.read_magic(member)
@@ -213,7 +213,7 @@ def _read_shape(path: Path, shape: tuple[int, int]) -> tuple[int, ...]:
 
 
 def read_arrays(path: Path, *keys: str) -> dict[str, NDArray[Any]]:
-    """Read those of the named arrays that an object's file holds; without names, all."""
+    """Read the named arrays from an object's file, or all without names; skip missing names."""
     check_no_pointer(path)
     try:
         # Opened here because numpy leaves its own file open when it is damaged.
@@ -231,7 +231,7 @@ def _damage_error(path: Path, error: Exception) -> RecordingError:
 
 
 def read_skipped(folder: Path) -> dict[str, str]:
-    """Read the objects that could not be made and the causes; empty without a list.
+    """Read the list of objects that could not be made: cause by name, or empty.
 
     Raises:
         RecordingError: the list is damaged.
@@ -246,6 +246,6 @@ def read_skipped(folder: Path) -> dict[str, str]:
 
 
 def write_skipped(folder: Path, skipped: dict[str, str]) -> None:
-    """Replace the list of objects that could not be made."""
+    """Write the list of objects that could not be made: cause by name."""
     text = msgspec.json.format(msgspec.json.encode(dict(sorted(skipped.items()))), indent=1)
     write_whole(folder / SKIPPED, lambda file: file.write(text))

@@ -1,7 +1,7 @@
-"""Faults of a robot's sensor that networks are trained with: drawn in training, never stored.
+"""Sensor faults that training adds to sweeps at random; they are never stored.
 
-A sweep set holds the loads of sound whiskers. Each time that training takes a sweep, it draws the
-sensor's faults anew, by these amounts, which the set's recipe may give.
+A sweep set holds the loads of sound whiskers. Each time that training uses a sweep, it draws the
+sensor's faults anew, with the amounts below, which the set's recipe may override.
 """
 
 from dataclasses import dataclass, fields
@@ -16,17 +16,17 @@ class SensorFaults:
     """Amounts of the sensor faults that training draws.
 
     Attributes:
-        noise: The largest noise, in units of the rated: a third of the sweeps have none, a third
-            the rated, the others any up to this one.
+        noise: The largest noise, in units of the rated noise: a third of the sweeps get none, a
+            third the rated noise, the others a random amount up to the largest.
         gain: The standard deviation of every whisker's relative gain error.
-        dead: The probability that a whisker reads nothing.
-        dead_row: The probability that a row of whiskers reads nothing.
-        offset: The largest standard deviation of the constant that every channel has gained since
-            its baseline, in units of its rated noise: half of the sweeps have no offset, the others
-            draw a share of it uniformly.
-        drift: The same for an offset that grows linearly until the end of a window.
-        implausible: The probability of loads that no touch makes, which a network learns to name:
-            channels swapped or turned, a gain far too large or small, half of the elements gone.
+        dead: The probability that a whisker reads zero.
+        dead_row: The probability that all whiskers of a row read zero.
+        offset: The largest standard deviation of a constant added to every channel after the
+            baseline, in units of the rated noise: half of the sweeps have no offset, for the others
+            the standard deviation is drawn uniformly up to this one.
+        drift: The same as `offset`, for an offset that grows linearly until the end of a window.
+        implausible: The probability of loads that no touch produces, which a network learns to
+            name: channels swapped or inverted, a far too large or small gain, missing elements.
 
     Raises:
         ConfigError: a probability outside [0, 1], or an amount below 0 or above `LARGEST`.

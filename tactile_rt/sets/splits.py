@@ -1,4 +1,4 @@
-"""Splits of sweep sets by object, checks of them, and sweep sets joined into one."""
+"""Functions that split sweep sets by object, check splits, and join or merge manifests."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -12,7 +12,7 @@ from tactile_rt.sets.manifest import OUTLIERS, SPLITS, UNLABELLED, WITHHELD, Swe
 def split_by_object(
     categories: Sequence[str], objects: int, validation: int, test: int
 ) -> dict[str, tuple[str, ...]]:
-    """Split `objects` instances of every category by object; the last ones are the test split."""
+    """Split `objects` objects of every category into training, validation and test, in order."""
     first = {"train": 0, "validation": objects - test - validation, "test": objects - test}
     stop = {"train": first["validation"], "validation": first["test"], "test": objects}
     return {
@@ -23,10 +23,10 @@ def split_by_object(
 
 
 def check_labelled(folder: Path, manifest: SweepManifest) -> None:
-    """Check that a set whose labels are used in training has labels.
+    """Check that a set has labels, for training that uses labels.
 
     Raises:
-        ConfigError: its touches have none.
+        ConfigError: the touches of the set are unlabelled.
     """
     if UNLABELLED in manifest.categories:
         raise ConfigError(
@@ -36,7 +36,7 @@ def check_labelled(folder: Path, manifest: SweepManifest) -> None:
 
 
 def check_split(folder: Path, manifest: SweepManifest) -> None:
-    """Check that splits share no object and every object to train on has a label."""
+    """Check that splits share no object and objects to train or test on have labels."""
     side: dict[str, str] = {}
     for split, names in manifest.split.items():
         for name in names:
@@ -57,7 +57,7 @@ def check_split(folder: Path, manifest: SweepManifest) -> None:
 def trained_objects(
     manifests: Sequence[SweepManifest], saved: Mapping[str, Any] | None = None
 ) -> dict[str, list[str]]:
-    """List the objects that a network was trained on, by their source."""
+    """List training objects by source: those of `manifests` and of an earlier checkpoint."""
     before = saved.get("trained_objects", {}) if saved else {}
     found = {source: dict.fromkeys(names) for source, names in before.items()}
     for one in manifests:
@@ -67,10 +67,10 @@ def trained_objects(
 
 
 def join_manifests(manifests: Sequence[SweepManifest]) -> SweepManifest:
-    """Join sets of one array into the first, with the categories and objects of all.
+    """Join manifests of one array: return the first, with categories and objects of all.
 
     Raises:
-        ConfigError: sets of another array or sensor, or of another period.
+        ConfigError: the sets differ in array, sensor or sample period.
     """
     first = manifests[0]
     for other in manifests[1:]:
@@ -101,13 +101,13 @@ def join_manifests(manifests: Sequence[SweepManifest]) -> SweepManifest:
 def merge_categories(
     manifest: SweepManifest, classes: Mapping[str, Sequence[str]]
 ) -> SweepManifest:
-    """Merge categories into classes; an object's category becomes its kind.
+    """Merge categories into classes; an object's old category becomes its kind.
 
     Args:
-        classes: the categories of each class; any other category stays a class.
+        classes: the categories to merge into each class; any other category is not changed.
 
     Raises:
-        ConfigError: the set has no such category, or it is of two classes.
+        ConfigError: the set lacks a category in `classes`, or a category is in two classes.
     """
     class_of: dict[str, str] = {}
     for one, categories in classes.items():
@@ -132,13 +132,14 @@ def merge_categories(
 def read_manifests(
     folders: Sequence[Path], labelled: bool
 ) -> tuple[list[SweepManifest], SweepManifest]:
-    """Read the manifests of sets to train on together: each, and all joined.
+    """Read and check the manifests of sets to train on; return each, and all joined.
 
     Args:
-        labelled: whether training uses their labels.
+        folders: folders of the sets.
+        labelled: True if training uses the labels.
 
     Raises:
-        ConfigError: they cannot be joined, or one has no labels to learn from.
+        ConfigError: the sets cannot be joined, or a set has no labels and `labelled` is True.
         RecordingError: a set is missing, is no sweep set, or has an invalid split.
     """
     manifests = [SweepManifest.read(folder) for folder in folders]

@@ -1,8 +1,8 @@
-"""Recordings that models are compared with, by name; each is imported on request.
+"""Datasets of recordings that models are compared with, by name; each is imported on request.
 
 A dataset states where its recordings come from (title, citation, license, size), and reads the
-files that its user downloaded or fetched: animals, and the input of the models if it is not the six
-stimuli that ship. Recordings are never bundled. Datasets of other packages are found by the entry
+files that the user downloaded or fetched: animals, and the input of the models if it is not that of
+the six stimuli. Recordings are never bundled. Datasets of other packages are found by the entry
 points ``tactile_rt.alignment_datasets``.
 """
 
@@ -24,11 +24,11 @@ ENTRY_POINTS = "tactile_rt.alignment_datasets"  # of other packages
 
 @dataclass(frozen=True, eq=False)
 class DatasetContents:
-    """The recordings that were read from a dataset.
+    """The recordings read from a dataset.
 
     Attributes:
-        stimuli: The input of the models for the dataset's conditions; None for the six stimuli
-            that ship or that the user names.
+        stimuli: The input of the models for the dataset's conditions; None for the input of the
+            six stimuli.
     """
 
     animals: tuple[Animal, ...]
@@ -41,16 +41,16 @@ Reader = Callable[[Sequence[Path], StimuliInput, Callable[[float], None]], Datas
 
 @dataclass(frozen=True, eq=False)
 class NeuralDataset:
-    """A public set of recordings, and how to read it.
+    """The description of a dataset of recordings, with the function that reads it.
 
     Attributes:
-        license: The SPDX name of its license; empty for a set of the user's own.
-        about: Sentences on what is compared and what that leaves out.
-        read: The function that reads downloaded files or folders. It takes them, the input of the
-            six stimuli, and a function to call with the share done, 0 to 1, and raises
-            `ConfigError` where they cannot be used.
-        listing: The file beside `fetching` that lists the files of one version, from which
-            `align fetch` gets the needed parts; empty if users must download the files.
+        license: The SPDX name of the license; empty for the user's own recordings.
+        about: Sentences on what is compared, and on limits of the comparison.
+        read: Function of downloaded files or folders, the input of the six stimuli, and a function
+            to call with the share done, 0 to 1. It returns the recordings, or raises `ConfigError`
+            if they cannot be used.
+        listing: The name of a file in this package that lists the files of one version, of which
+            `align fetch` downloads the needed parts; empty if users must download the files.
         counts: The numbers of mice and of units in the published analysis, to compare the fetched
             files with; None if unknown.
     """

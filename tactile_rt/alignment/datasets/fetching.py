@@ -2,10 +2,10 @@
 
 A session has gigabytes, nearly all of them voltages. Alignment needs trials, contacts and spikes:
 these are read from the archive's own files by HTTP ranges and written to small NWB files of the
-same structure, which can be used like whole ones.
+same structure, which can be used like the original files.
 
-The list names files by name, size and checksum. It is of one version of the dataset, and its
-addresses are of one version of every file, so that everybody fetches the same data.
+The list gives each file's name, size, checksum and address, for one version of the dataset, so that
+all users fetch the same data.
 """
 
 import csv
@@ -30,11 +30,11 @@ BLOCK = 1 << 16  # bytes of a block
 KEPT = 1 << 10  # blocks in the cache at most
 PATIENCE_S = 60.0  # timeout of a request
 AGAIN = 4  # retries of a request, after 0, 1, 2 and 4 s
-BUSY = (429, 500, 502, 503, 504)  # HTTP status codes that are worth a retry
+BUSY = (429, 500, 502, 503, 504)  # HTTP status codes after which a request is retried
 
 
 def connections() -> "urllib3.PoolManager":
-    """Return a pool of connections that stay open, through the proxy if one is set."""
+    """Make an HTTP connection pool with retries, through the proxy if the system has one."""
     import urllib3
 
     again = urllib3.Retry(AGAIN, backoff_factor=0.5, status_forcelist=BUSY, raise_on_status=False)
@@ -45,14 +45,14 @@ def connections() -> "urllib3.PoolManager":
 
 
 class RangeFile(io.RawIOBase):
-    """A file of known size on a web server, read by HTTP ranges.
+    """A read-only file object for a file on a web server, read by HTTP ranges.
 
     Bytes are fetched in blocks, which are cached: the metadata of HDF5 is small, scattered over
     gigabytes, and read again and again. Adjacent missing blocks are fetched by one request.
-    h5py replaces errors of its file by errors of its own; the first one stays in `error`.
+    h5py hides this object's errors behind its own; the first error's message stays in `error`.
 
     Args:
-        size: in bytes; a server that reports another size has another file.
+        size: the file's size in bytes; an error if the server reports another size.
     """
 
     def __init__(self, pool: "urllib3.PoolManager", url: str, size: int) -> None:
@@ -92,7 +92,7 @@ class RangeFile(io.RawIOBase):
         return end - begin
 
     def _fetch(self, first: int, last: int) -> None:
-        """Fetch the blocks from first to last, both included."""
+        """Fetch blocks `first` to `last`, inclusive, into the cache."""
         import urllib3
 
         begin, end = first * BLOCK, min((last + 1) * BLOCK, self._size)
@@ -113,7 +113,7 @@ class RangeFile(io.RawIOBase):
                     raise ConfigError(f"the server says {answer.status} {answer.reason or ''}")
                 data = answer.read()
             except ConfigError:
-                answer.close()  # its remaining bytes would be taken for the next answer
+                answer.close()  # or its remaining bytes would be read as the next answer
                 raise
             answer.release_conn()
             if len(data) != end - begin:
@@ -129,7 +129,7 @@ class RangeFile(io.RawIOBase):
 
 @dataclass(frozen=True)
 class PublishedFile:
-    """A session's file in an archive."""
+    """A session's file in a public archive, as the list names it."""
 
     path: str  # path in the dataset, ``sub-231CR/sub-231CR_ses-20190921T144923_....nwb``
     size: int  # bytes
@@ -138,12 +138,12 @@ class PublishedFile:
 
     @property
     def name(self) -> str:
-        """The name of the file alone."""
+        """Name of the file without folders."""
         return PurePosixPath(self.path).name
 
 
 def published_files(listing: str) -> tuple[PublishedFile, ...]:
-    """Read the list of a dataset's files with spikes that ships with the package."""
+    """Read the list of a dataset's files with spikes from this package."""
     text = resources.files(__package__).joinpath(listing).read_text("utf-8")
     return tuple(
         PublishedFile(row["path"], int(row["bytes"]), row["sha256"], row["url"])
@@ -156,7 +156,7 @@ def fetch(
     folder: Path,
     progress: Callable[[float], None] = lambda share: None,
 ) -> tuple[int, int]:
-    """Fetch the parts of files that alignment needs, each into a small NWB file.
+    """Download the parts of files that alignment needs, each into a small NWB file.
 
     Files that exist are skipped, so that an interrupted fetch can be resumed.
 
@@ -164,8 +164,8 @@ def fetch(
         The number of new files, and the number of bytes received over the network.
 
     Raises:
-        ConfigError: a file cannot be fetched, or is not the published one; the files before it
-            are in the folder.
+        ConfigError: a file cannot be fetched, or differs from the published file; earlier files
+            stay in the folder.
     """
     pool = connections()
     new = transferred = 0
@@ -181,14 +181,14 @@ def fetch(
 
 
 def count_recorded(paths: Sequence[Path]) -> tuple[int, int, list[str]]:
-    """Count mice and units of sessions with valid trials, and note what was left out."""
+    """Count the mice and units of sessions with valid trials; return notes on omissions too."""
     readings, notes = read_nwb(paths, "start")
     mice = {reading.session.animal for reading in readings}
     return len(mice), sum(r.session.rates.shape[1] for r in readings), notes
 
 
 def _extract_needed(remote: RangeFile, published: PublishedFile) -> tuple[bytes, int]:
-    """Copy the needed parts of a remote NWB file; return them and the bytes received."""
+    """Copy the needed parts of a remote NWB file; return them and bytes received."""
     import h5py
 
     small = io.BytesIO()
@@ -225,7 +225,7 @@ def _find_columns(file: Any) -> Iterator[str]:
 
 
 def _find_clocks(file: Any) -> Iterator[tuple[str, float]]:
-    """Yield the path of each whisker's timestamps and the last of them, s. No other is needed."""
+    """Yield the path and last value, s, of each whisker's timestamps. No other is needed."""
     for module in file.get("processing", {}).values():
         for name, group in module.items():
             end = parts.last_time(group) if name.startswith(parts.WHISKER) else None

@@ -1,4 +1,4 @@
-"""The dataset of a user's own recordings, of any stimuli, which `named_recordings` reads."""
+"""The dataset of the user's own recordings, of any named stimuli (`named_recordings`)."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Shapes felt by mice: DANDI 000231 (Rodgers 2022), and made-up recordings in its format."""
+"""The dataset DANDI 000231 (Rodgers 2022), and synthetic recordings in its format."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path

@@ -1,9 +1,9 @@
 """Metrics of the similarity of a layer and an animal, each with its noise ceiling.
 
-A metric is a function. It takes an animal and returns its `Measure`: the value that a perfect model
-is expected to reach (the ceiling), and a function that measures a layer. What depends on the animal
-alone is thus computed only once for all layers and models. Metrics of other packages are found by
-the entry points ``tactile_rt.alignment_metrics``.
+A metric is a function. It takes an animal and returns a `Measure`: the value that a perfect model
+is expected to reach (the ceiling), and a function that measures a layer. So everything that depends
+on the animal alone is computed only once. Metrics of other packages are found by the entry points
+``tactile_rt.alignment_metrics``.
 
 noise_ceiling  means over random halves of the trials, from which ceilings are estimated
 rsa_cka        rsa, rsa-time and cka: the similarity of two geometries
@@ -84,7 +84,7 @@ def metric_names() -> tuple[str, ...]:
 
 
 def find_metric(name: str) -> Metric:
-    """Return the function of a metric."""
+    """Return the function of an installed metric by the metric's name."""
     if name in METRICS:
         module, _, function = METRICS[name][0].partition(":")
         ours: Metric = getattr(import_module(module), function)

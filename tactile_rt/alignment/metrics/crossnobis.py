@@ -20,7 +20,7 @@ from tactile_rt.alignment.rdm import Floats, pearson, upper
 
 
 def crossnobis(animal: Animal) -> Measure:
-    """Prepare the correlation of a layer's distances with an animal's cross-validated ones."""
+    """Prepare a measure: the correlation of a layer's distances with an animal's crossnobis."""
     sessions = sessions_of(animal)
     if not sessions:
         return NOTHING
@@ -43,15 +43,12 @@ def crossnobis(animal: Animal) -> Measure:
 
 
 def distances(white: Floats, stimulus: NDArray[np.int64], chosen: NDArray[np.bool_]) -> Floats:
-    """Compute cross-validated squared distances, summed over units.
+    """Compute cross-validated squared distances (division, pair), summed over units.
 
     Args:
-        white: (trial, unit), whitened.
-        stimulus: (trial,), indices from 0 on without gaps.
-        chosen: (division, trial), True for trials that count; at least two of every stimulus.
-
-    Returns:
-        (division, pair).
+        white: (trial, unit) whitened responses.
+        stimulus: (trial,) indices from 0 on without gaps.
+        chosen: (division, trial) True for trials that count; at least two of every stimulus.
     """
     of_each = [chosen * (stimulus == k) for k in range(int(stimulus.max()) + 1)]
     weights = np.stack(of_each, axis=1).astype(np.float64)  # (division, stimulus, trial)
@@ -66,7 +63,7 @@ def distances(white: Floats, stimulus: NDArray[np.int64], chosen: NDArray[np.boo
 
 
 def shrunk_covariance(residuals: Floats, freedom: int) -> Floats:
-    """Estimate the covariance of residuals (trial, unit), correlations shrunk towards zero."""
+    """Estimate the covariance of residuals (trial, unit), with correlations shrunk to zero."""
     n = len(residuals)
     products = residuals.T @ residuals
     squares = (residuals**2).T @ residuals**2
@@ -86,7 +83,7 @@ def _compute_whitening(session: NeuralSession) -> Floats:
     residuals = rates.copy()
     for k in range(len(session.stimuli)):
         residuals[stimulus == k] -= rates[stimulus == k].mean(axis=0)
-    live = (residuals**2).sum(axis=0) > 0  # the noise of a unit that never varies is unknown
+    live = (residuals**2).sum(axis=0) > 0  # the noise of a constant unit is unknown
     out = np.zeros((len(live), len(live)))
     if live.any():
         freedom = len(rates) - len(session.stimuli)

@@ -1,4 +1,4 @@
-"""Share of units' variance that a layer's linear readout predicts for a held-out stimulus.
+"""Share of units' variance that a linear readout of a layer predicts for a held-out stimulus.
 
 One stimulus is held out at a time. A ridge regression from the layer's steps to the units'
 bins of 45 ms (without a time course: from means to means) is fitted to the others, its penalty
@@ -24,7 +24,7 @@ PENALTIES = tuple(10.0**k for k in range(-4, 3))  # times the mean of the kernel
 
 
 def linear(animal: Animal) -> Measure:
-    """Prepare the held-out variance that a layer explains, pooled over an animal's units."""
+    """Prepare a measure: the share of variance that a layer predicts for held-out stimuli."""
     sessions = sessions_of(animal)
     if not sessions:
         return NOTHING
@@ -58,9 +58,9 @@ def linear(animal: Animal) -> Measure:
 
 
 def predict_held_out(layer: Floats, goal: Floats) -> Floats:
-    """Predict the goal's responses to every stimulus by regressions fitted to the others.
+    """Predict the goal's response to each stimulus by a regression on the other stimuli.
 
-    The layer is (stimulus, bin, feature), the goal (stimulus, bin, unit), and so is the result.
+    The layer is (stimulus, bin, feature), the goal and the result are (stimulus, bin, unit).
     """
     out = np.empty_like(goal)
     for i in range(len(goal)):
@@ -93,7 +93,7 @@ def _predict_ridge(
 
 
 def _estimate_noise(session: NeuralSession, bins: int) -> Floats:
-    """Estimate the variance of the mean over trials: (stimulus, bin, unit)."""
+    """Estimate the squared standard error (stimulus, bin, unit) of mean responses."""
     values = values_of(session, bins)
     out = np.empty((len(session.stimuli), *values.shape[1:]))
     for k in range(len(session.stimuli)):

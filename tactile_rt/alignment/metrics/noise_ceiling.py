@@ -1,7 +1,7 @@
-"""Means over an animal's trials and over random halves of them, and the noise ceiling.
+"""Means over an animal's trials and over random halves of the trials, and the noise ceiling.
 
 Halves are drawn within every session and stimulus; their agreement gives the reliability of the
-whole (Spearman-Brown). A bin that some trials do not reach is averaged over those that do.
+whole (Spearman-Brown). A bin that some trials do not reach is averaged over the other trials.
 """
 
 import numpy as np
@@ -14,18 +14,18 @@ from tactile_rt.alignment.reliability import spearman_brown
 DIVISIONS = 100
 SEED = 1234
 MINIMUM_TRIALS = 4  # of every stimulus in a session: two in each half
-MINIMUM_UNITS = 5  # of an animal: with fewer its correlations over units are mostly 1 or -1
-LONGEST = 22  # bins: the steps of the models
+MINIMUM_UNITS = 5  # of an animal: with fewer, correlations over units are mostly 1 or -1
+LONGEST = 22  # largest number of bins: the steps of the models
 
 
 def sessions_of(animal: Animal) -> tuple[NeuralSession, ...]:
-    """Return the sessions with enough trials per stimulus; none if their units are too few."""
+    """Return an animal's sessions with enough trials per stimulus, or () with too few units."""
     kept = tuple(s for s in animal.sessions if s.trials.min() >= MINIMUM_TRIALS)
     return kept if sum(s.rates.shape[1] for s in kept) >= MINIMUM_UNITS else ()
 
 
 def bins_of(sessions: tuple[NeuralSession, ...]) -> int:
-    """Count first bins that enough trials per stimulus reach in all sessions; 0 without courses."""
+    """Return the number of bins that enough trials reach in all sessions; 0 without courses."""
     reached = [LONGEST]
     for session in sessions:
         if session.course is None:
@@ -38,14 +38,14 @@ def bins_of(sessions: tuple[NeuralSession, ...]) -> int:
 
 
 def values_of(session: NeuralSession, bins: int) -> Floats:
-    """Return rates (trial, bin, unit) of the first bins, or one bin of whole trials."""
+    """Return rates (trial, bin, unit) in the first `bins` bins, or whole-trial rates."""
     if bins and session.course is not None:
         return session.course[:, :bins]
     return session.rates[:, None]
 
 
 def divisions(session: NeuralSession, number: int = DIVISIONS) -> NDArray[np.bool_]:
-    """Draw random divisions of a session's trials: (division, trial), True for half 1."""
+    """Draw random halves of a session's trials: masks (division, trial), True for half 1."""
     rng = np.random.default_rng([SEED, len(session.stimulus)])
     first = np.zeros((number, len(session.stimulus)), dtype=np.bool_)
     for stimulus in range(len(session.stimuli)):
@@ -74,9 +74,9 @@ def means_of(sessions: tuple[NeuralSession, ...], bins: int) -> Floats:
 
 
 def ceiling_of(agreements: Floats) -> float:
-    """Return the ceiling: the root of the reliability, from the agreements of halves.
+    """Return the noise ceiling, the root of the reliability, from the agreement of halves.
 
-    The agreements (division,) are correlations or cosines; NaN if the reliability is not above 0.
+    The agreements (division,) are correlations or cosines. NaN if the reliability is not above 0.
     """
     finite = agreements[np.isfinite(agreements)]
     reliability = float(spearman_brown(finite.mean())) if finite.size else np.nan

@@ -1,6 +1,6 @@
-"""Similarity of two geometries: of a layer's responses to stimuli and of an animal's.
+"""Similarity of two geometries: of a layer's and of an animal's responses to the stimuli.
 
-- `rsa`: Pearson's r of the dissimilarities 1 - r (Kriegeskorte 2008), mean over time.
+- `rsa`: Pearson's r of the dissimilarities 1 - r (Kriegeskorte 2008) of mean responses over time.
 - `rsa_time`: the same in each bin of 45 ms, which is a step of the model, both counted from the
   first contact; r and ceiling are each averaged over the bins in which the animal is reliable. In
   a bin in which a layer responds to all stimuli alike, its fit is 0.
@@ -24,12 +24,12 @@ NOTHING = Measure(float("nan"), lambda layer: float("nan"))  # for too few trial
 
 
 def rsa(animal: Animal) -> Measure:
-    """Prepare the representational similarity of mean responses."""
+    """Prepare a measure: the RSA of a layer and an animal, from time-averaged responses."""
     return _compare_means(animal, rdm, pearson)
 
 
 def rsa_time(animal: Animal) -> Measure:
-    """Prepare the representational similarity in every bin of 45 ms."""
+    """Prepare a measure: the RSA of a layer and an animal, averaged over time bins."""
     found = time_course(animal)
     if found is None:
         return NOTHING
@@ -64,14 +64,14 @@ def time_course(animal: Animal) -> tuple[Floats, Floats] | None:
 
 
 def cka(animal: Animal) -> Measure:
-    """Prepare the centred kernel alignment of mean responses, U-centred."""
+    """Prepare a measure: the U-centred CKA of a layer and an animal's time-averaged responses."""
     return _compare_means(animal, u_centred, cosine)
 
 
 def _compare_means(
     animal: Animal, form: Callable[[Floats], Floats], agree: Callable[[Floats, Floats], Floats]
 ) -> Measure:
-    """Prepare the agreement of mean responses in a form such as their RDM."""
+    """Prepare a measure that compares mean responses after conversion by `form`, e.g. to RDMs."""
     sessions = noise_ceiling.sessions_of(animal)
     if not sessions:
         return NOTHING
@@ -87,8 +87,7 @@ def _compare_means(
 def u_centred(patterns: Floats) -> Floats:
     """Compute the U-centred linear kernel's upper entries from responses (..., n, unit).
 
-    Returns:
-        (..., n (n - 1) / 2), for n of at least 4.
+    The entries are (..., n (n - 1) / 2); n is at least 4.
     """
     kernel = np.matmul(patterns, np.swapaxes(patterns, -1, -2))
     n = kernel.shape[-1]
@@ -111,7 +110,7 @@ def cosine(a: Floats, b: Floats) -> Floats:
 
 
 def mean_pattern(layer: Floats) -> Floats:
-    """Average over the steps that input reaches: (stimulus, step, unit) -> (stimulus, unit)."""
+    """Average a layer (stimulus, step, unit) over its finite steps; return (stimulus, unit)."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", RuntimeWarning)  # NaN for a layer that no input reaches
         return np.asarray(np.nanmean(layer, axis=1))

@@ -1,7 +1,7 @@
-"""Attenders: the parts of a network that join a step's features with those of earlier steps.
+"""Attenders: the part of a network that combines a step's features with those of earlier steps.
 
-Every attender maps features `(batch, step, feature)` to the same shape, causally, and has a
-`step` that gives the same step by step.
+Every attender maps features `(batch, step, feature)` to the same shape, causally; its `step`
+computes the same for one step at a time.
 """
 
 from torch import Tensor, nn
@@ -13,7 +13,7 @@ __all__ = ["GPT", "HEADS", "TOKENS", "MambaStack", "NoAttender"]
 
 
 class NoAttender(nn.Module):
-    """An attender that leaves each step on its own."""
+    """Identity attender, which combines no steps."""
 
     def forward(self, features: Tensor) -> Tensor:
         """Return features (batch, step, feature) unchanged."""
@@ -25,5 +25,5 @@ class NoAttender(nn.Module):
     def step(
         self, features: Tensor, index: Tensor, state: dict[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Return features (batch, feature) unchanged, and {}."""
+        """Return the features (batch, feature) of one step unchanged, and an empty state."""
         return features, {}

@@ -1,4 +1,4 @@
-"""The GPT attender: a causal transformer over a step's features and an action token."""
+"""The GPT attender: a causal transformer over each step's features and an action token."""
 
 import math
 
@@ -12,7 +12,7 @@ __all__ = ["BLOCK", "GPT", "HEADS", "LAYERS", "MAX_STEPS", "TOKENS", "Transforme
 
 HEADS = 4
 LAYERS = 8
-BLOCK = 2 * MAX_STEPS + 1  # positions in the table: two tokens a step, and one more as in the paper
+BLOCK = 2 * MAX_STEPS + 1  # positions in the table: two tokens per step, plus one as in the paper
 TOKENS = 2  # a step's observation, then the action token
 
 
@@ -30,19 +30,19 @@ class TransformerBlock(nn.Module):
         self.dropout = dropout
 
     def heads(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return queries, keys, values (batch, head, token, ·) of tokens (batch, token, width)."""
+        """Map tokens (batch, token, width) to queries, keys, values (batch, head, token, ·)."""
         qkv = self.qkv(self.norm1(x)).unflatten(-1, (3, HEADS, -1))  # (batch, token, 3, head, ·)
         q, k, v = qkv.permute(2, 0, 3, 1, 4).unbind(0)  # (batch, head, token, ·) each
         return q, k, v
 
     def merge(self, x: Tensor, attended: Tensor) -> Tensor:
-        """Apply the rest of the layer to attended (batch, head, token, ·)."""
+        """Complete the layer for tokens x, given the attention's output (batch, head, token, ·)."""
         x = x + self._drop(self.proj(attended.transpose(1, 2).flatten(2)))  # (batch, token, width)
         hidden = F.gelu(self.mlp_in(self.norm2(x)), approximate="tanh")  # (batch, token, 4 width)
         return x + self._drop(self.mlp_out(hidden))
 
     def forward(self, x: Tensor) -> Tensor:
-        """Map all tokens (batch, token, width) at once; each attends to itself and those before."""
+        """Map all tokens (batch, token, width); each attends to itself and to earlier tokens."""
         q, k, v = self.heads(x)
         dropout = self.dropout if self.training else 0.0
         return self.merge(
@@ -56,13 +56,13 @@ class TransformerBlock(nn.Module):
 class GPT(nn.Module):
     """Causal transformer over (observation, action token) pairs (paper, section "EAD"; GPT-2).
 
-    A learned action token follows every step's features; its outputs are the attender's.
+    A learned action token follows every step's features; its output is the step's output.
 
     Args:
-        dropout: share of the activations, while training.
-        max_steps: an episode's; at most `MAX_STEPS`.
-        inputs: features per step that come in, `width` by default. The paper's ResNet18 has
-            512 and its GPT 256.
+        dropout: share of activations that are dropped in training.
+        max_steps: steps of an episode, at most `MAX_STEPS`.
+        inputs: features per step of the input, default `width`. The paper's ResNet18 has 512, its
+            GPT 256.
     """
 
     def __init__(
@@ -83,14 +83,14 @@ class GPT(nn.Module):
         std = 0.02 * math.sqrt(512 / width)  # GPT-2's at full width; narrower sums fewer terms
         for name, module in self.named_modules():
             if isinstance(module, nn.Linear):
-                # Every layer adds twice to the residual: keep the variance at that of one.
+                # Every layer adds two terms to the residual: keep its variance at that of one term.
                 shrink = math.sqrt(2 * LAYERS) if name.endswith(("proj", "mlp_out")) else 1.0
                 nn.init.normal_(module.weight, std=std / shrink)
                 if module.bias is not None:
                     nn.init.zeros_(module.bias)
 
     def forward(self, features: Tensor) -> Tensor:
-        """features (batch, step, inputs) -> (batch, step, width)
+        """Map features (batch, step, inputs) to (batch, step, width).
 
         Raises:
             ValueError: more steps than `max_steps`.
@@ -107,7 +107,7 @@ class GPT(nn.Module):
         return out
 
     def initial_state(self, batch: int) -> dict[str, Tensor]:
-        """Return empty key and value caches, (batch, layer, head, step, token, width / head)."""
+        """Return zero key and value caches (batch, layer, head, step, token, width / head)."""
         head = self.positions.shape[1] // HEADS
         shape = (batch, LAYERS, HEADS, self.max_steps, TOKENS, head)
         zeros = self.positions.new_zeros
@@ -116,9 +116,10 @@ class GPT(nn.Module):
     def step(
         self, features: Tensor, index: Tensor, state: dict[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Run one step: features (batch, inputs), index (batch,) int64, steps since the reset.
+        """Map the features (batch, inputs) of one step to (batch, width) and a new state.
 
-        Past `max_steps` every step overwrites the last position: reset before.
+        `index` (batch,) int64 counts steps since the reset. From `max_steps` on, every step
+        overwrites the last position, so reset before.
         """
         index = index.clamp(max=self.max_steps - 1)
         slots = torch.arange(self.max_steps, device=index.device)
@@ -144,7 +145,7 @@ class GPT(nn.Module):
         return out, {"gpt_k": torch.stack(keys, 1), "gpt_v": torch.stack(values, 1)}
 
     def _project(self, features: Tensor) -> Tensor:
-        """features (..., inputs) -> (..., token, width): the observation, then the action token."""
+        """Map features (..., inputs) to tokens (..., token, width): observation, then action."""
         action = self.action.expand_as(features)
         out: Tensor = self.project_in(torch.stack([features, action], dim=-2))
         return out

@@ -6,12 +6,12 @@ channel d and state n
     h_t[d, n] = exp(dt_t[d] A[d, n]) h_{t-1}[d, n] + dt_t[d] B_t[n] x_t[d]
     y_t[d] = sum_n C_t[n] h_t[d, n] + D[d] x_t[d]
 
-where dt, B and C are computed from x itself, so that the loads choose what is kept and what is
-forgotten. The output is y silu(z), projected back.
+where dt, B and C are computed from x itself, so that the input controls what the state keeps and
+forgets. The output is y silu(z), projected back.
 
-The scan over a window is written out with its gradient. Time is its first axis, so that a step is a
-contiguous block: the recurrence is a loop of products into buffers that already hold what they add
-to, and everything else is done for all steps at once.
+The scan over a window has an explicit gradient. Time is its first axis, so that a step is a
+contiguous block: the recurrence is a loop of multiply-adds into buffers that already hold the
+addends, and everything else is computed for all steps at once.
 """
 
 import math
@@ -26,12 +26,12 @@ LAYERS = 4
 STATES = 16
 TAPS = 4  # of the causal convolution
 EXPAND = 2
-RANK = 16  # the step size dt has one rank per so many features
+RANK = 16  # features per rank of the step size dt
 DT_RANGE = (1e-3, 1e-1)
 
 
 class MambaBlock(nn.Module):
-    """One layer: features (batch, step, width) to the same shape, without the residual."""
+    """One Mamba layer, features (batch, step, width) to the same shape, without the residual."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
@@ -58,7 +58,7 @@ class MambaBlock(nn.Module):
             parameter._optim = {"lr_scale": 1.0, "weight_decay": 0.0}  # type: ignore[attr-defined]
 
     def forward(self, features: Tensor) -> Tensor:
-        """Process all steps at once, from a zero state."""
+        """Map features (batch, step, width) to the same shape, from a zero state."""
         x, gate = self.in_proj(features).chunk(2, dim=-1)  # (batch, step, inner) each
         steps = x.shape[1]
         padded = F.pad(x, (0, 0, TAPS - 1, 0))
@@ -70,10 +70,10 @@ class MambaBlock(nn.Module):
         return self._project_out(y, x, gate)
 
     def step(self, features: Tensor, taps: Tensor, h: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Run one step.
+        """Map the features (batch, width) of one step; return output, taps and h.
 
-        features (batch, width), taps (batch, TAPS - 1, inner): the last x, oldest first,
-        h (batch, inner, STATES) -> the output and the new taps and h
+        taps (batch, TAPS - 1, inner): the last inputs x of the convolution, oldest first
+        h    (batch, inner, STATES): the state of the recurrence
         """
         x, gate = self.in_proj(features).chunk(2, dim=-1)  # (batch, inner) each
         taps = torch.cat([taps, x[:, None]], dim=1)  # (batch, TAPS, inner)
@@ -83,10 +83,10 @@ class MambaBlock(nn.Module):
         return self._project_out((h * c[:, None]).sum(-1), x, gate), taps[:, 1:], h
 
     def _select(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Return the arguments of `selective_scan` for x (..., inner): dt, x, a, b and c."""
+        """Compute the arguments of `selective_scan` from x (..., inner): dt, x, a, b and c."""
         dt, b, c = self.x_proj(x).split([self.rank, STATES, STATES], dim=-1)
         dt = F.softplus(self.dt_proj(dt))
-        # In the parameters' type whatever autocast says: the state is a long product.
+        # In the parameters' type, even under autocast: the state is a long product.
         exact = self.A_log.dtype
         return dt.to(exact), x.to(exact), -torch.exp(self.A_log), b.to(exact), c.to(exact)
 
@@ -96,10 +96,10 @@ class MambaBlock(nn.Module):
 
 
 class MambaStack(nn.Module):
-    """Four pre-norm residual Mamba blocks and a last norm: 6,784,000 parameters at 512.
+    """Four pre-norm residual Mamba blocks and a final norm; 6,784,000 parameters at width 512.
 
     Args:
-        prefix: prefix of the names in the state, so that an encoder's and an attender's differ.
+        prefix: prefix of the state's names, so that those of encoder and attender differ.
     """
 
     def __init__(self, width: int, prefix: str = "mamba") -> None:
@@ -110,7 +110,7 @@ class MambaStack(nn.Module):
         self.norm = nn.LayerNorm(width)
 
     def forward(self, features: Tensor) -> Tensor:
-        """features (batch, step, width) -> (batch, step, width)"""
+        """Map features (batch, step, width) to the same shape, from a zero state."""
         x = features
         for block, norm in zip(self.blocks, self.norms, strict=True):
             x = x + block(norm(x))
@@ -118,7 +118,7 @@ class MambaStack(nn.Module):
         return out
 
     def initial_state(self, batch: int) -> dict[str, Tensor]:
-        """Return zeros: taps (batch, layer, TAPS - 1, inner), h (batch, layer, inner, STATES)."""
+        """Return zero taps (batch, layer, TAPS - 1, inner) and h (batch, layer, inner, STATES)."""
         inner = EXPAND * self.features
         zeros = self.norm.weight.new_zeros
         return {
@@ -129,7 +129,7 @@ class MambaStack(nn.Module):
     def step(
         self, features: Tensor, index: Tensor, state: dict[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Run one step: features (batch, width) -> (batch, width), the new state."""
+        """Map the features (batch, width) of one step; return output and new state."""
         old_taps, old_h = state[f"{self.prefix}_taps"], state[f"{self.prefix}_h"]
         x, new_taps, new_h = features, [], []
         for layer, (block, norm) in enumerate(zip(self.blocks, self.norms, strict=True)):
@@ -146,10 +146,10 @@ class MambaStack(nn.Module):
 
 
 def selective_scan(dt: Tensor, x: Tensor, a: Tensor, b: Tensor, c: Tensor) -> Tensor:
-    """Return y_t = h_t c_t of a recurrence that starts from h = 0.
+    """Run the selective state-space recurrence from h = 0; return y (batch, step, channel).
 
-    h_t = exp(dt_t a) h_{t-1} + dt_t x_t b_t, with dt, x (batch, step, channel); a (channel, state);
-    b, c (batch, step, state) -> y (batch, step, channel). All real, of one type.
+    h_t = exp(dt_t a) h_{t-1} + dt_t x_t b_t and y_t = h_t c_t, with dt, x (batch, step, channel);
+    a (channel, state); b, c (batch, step, state), all real and of one type.
     """
     steps_first = [part.transpose(0, 1).contiguous() for part in (dt, dt * x, b, c)]
     with torch.autocast(x.device.type, enabled=False):
@@ -158,7 +158,7 @@ def selective_scan(dt: Tensor, x: Tensor, a: Tensor, b: Tensor, c: Tensor) -> Te
 
 
 class _Scan(torch.autograd.Function):
-    """The scan with its gradient, (step, batch, ·) throughout; u is dt x."""
+    """The recurrence of `selective_scan` with its gradient, on (step, batch, ·); u is dt x."""
 
     @staticmethod
     def forward(ctx: Any, dt: Tensor, u: Tensor, b: Tensor, c: Tensor, a: Tensor) -> Tensor:

@@ -1,1 +1,1 @@
-"""Encoders: frames `(batch, step, channel, row, column)` to features `(batch, step, feature)`."""
+"""Encoders of frames `(batch, step, channel, row, column)` to features `(batch, step, feature)`."""

@@ -1,13 +1,13 @@
-"""Recurrent cells on the whisker map.
+"""Recurrent cells of convolutional networks on the array's grid.
 
 A cell takes its node's convolution `x` and its own state, maps `(row, column, lane, channel)`,
-and returns the node's output and the new state. Input and state are convolved together; `*` below
-is that convolution. With `layer_norm` each gate is normalised over its channels, per site, before
-the non-linearity; constants such as the forget bias come after it, or they would be normalised
-away. States begin at zero.
+and returns the node's output and the new state; a lane is one stream of the batch. Input and state
+are convolved together; `*` below is that convolution. With `layer_norm` each gate is normalised
+over its channels, per site, before the non-linearity; constants such as the forget bias are added
+after it, or they would be normalised away. The initial state is zero.
 
-Two cells differ between Nayebi et al.'s equations, "lstm-ln" and "vanilla", and the code that was
-published with the paper, "lstm-ln-published" and "vanilla-elu" or "vanilla-elu-ln".
+For two cells Nayebi et al.'s equations ("lstm-ln", "vanilla") differ from the code published with
+the paper ("lstm-ln-published", and "vanilla-elu" or "vanilla-elu-ln").
 """
 
 from collections.abc import Callable
@@ -25,20 +25,20 @@ from tactile_rt.models.encoders.convolution import Convolution, convolve
 FORGET_BIAS = 1.0
 # Where nothing is touched the gates have no variance, and the gradient through a norm grows by
 # 1 / sqrt(epsilon) with every step: at the usual 1e-5 it reaches 1e29 in a window of 22. At 1 it
-# stays below 10 with every cell. The Intersection's x passes beside the norms: it tolerates 0.1.
+# stays below 10 with every cell. The Intersection's x bypasses the norms, so 0.1 is enough there.
 NORM_EPSILON = 1.0
 
 State = tuple[Tensor, ...]
 
 
 class Cell(nn.Module):
-    """The base of all cells: one convolution to `gates` maps, and the norm of each.
+    """Base class of recurrent cells: a convolution that computes all gates, and layer norms.
 
     Attributes:
-        gates: The number of maps that `conv` makes, one per gate.
-        norms: The number of maps that the layer norm, where used, normalises.
+        gates: The number of maps that `conv` computes, one per gate.
+        norms: The number of maps that layer norms are applied to, if used.
         states: The names of the state's tensors, each shaped like x.
-        epsilon: The layer norm's epsilon, which is added to the variance.
+        epsilon: The layer norms' epsilon, which is added to the variance.
     """
 
     gates: ClassVar[int]
@@ -57,21 +57,21 @@ class Cell(nn.Module):
         if layer_norm:
             self.gamma = nn.Parameter(torch.ones(self.norms, channels))
             self.beta = nn.Parameter(torch.zeros(self.norms, channels))
-            for norm in (self.gamma, self.beta):  # to an optimizer, each row is a tensor of a norm
+            for norm in (self.gamma, self.beta):  # an optimizer treats each row as a tensor
                 norm._optim = {"stacked": True}  # type: ignore[attr-defined]
 
     def drive(self, x: Tensor) -> Tensor | None:
-        """Return W*x + b alone, for an x known for many steps at once."""
+        """Return the gates' input W*x + b, of one or many steps; None if unused."""
         return convolve(self.conv.weight[..., : self.channels], self.conv.bias, x)
 
     def forward(self, x: Tensor, state: State, drive: Tensor | None = None) -> tuple[Tensor, State]:
-        """Return the output h, shaped like x, and the new state; `drive` saves convolving x."""
+        """Return the output h, shaped like x, and the new state, given `self.drive(x)` or None."""
         raise NotImplementedError
 
     def convolve_gates(self, x: Tensor, recurrent: Tensor, drive: Tensor | None) -> Tensor:
-        """Return the gates before their non-linearity, (..., gate * channel), in the state's type.
+        """Return the gates (..., gate * channel) before the non-linearity, in the state's type.
 
-        Autocast rounds the convolutions, but not the memory.
+        Autocast rounds the convolutions, but the state keeps its precision.
         """
         if drive is None:
             gates = self.conv(x, recurrent)
@@ -80,7 +80,7 @@ class Cell(nn.Module):
         return self.normal(gates.to(recurrent.dtype))
 
     def normal(self, gates: Tensor, first: int = 0) -> Tensor:
-        """Normalise maps (..., n * channel) by the cell's layer norms from `first` on."""
+        """Apply layer norms number `first` and following to maps (..., n * channel), if used."""
         if self.gamma is None or self.beta is None:
             return gates
         n = gates.shape[-1] // self.channels
@@ -90,9 +90,9 @@ class Cell(nn.Module):
 
 
 class TimeDecayCell(Cell):
-    """Time decay (Zhuang et al. 2017): s' = x + tau s, h = s'.
+    """Time-decay cell (Zhuang et al. 2017): s' = x + tau s, h = s'.
 
-    tau is one learned number, at first 0. With `layer_norm`, x is normalised: there is no gate.
+    tau is one learned number, initially 0. With `layer_norm`, x is normalised: there is no gate.
     """
 
     gates, norms = 0, 1
@@ -110,7 +110,7 @@ class TimeDecayCell(Cell):
 
 
 class VanillaCell(Cell):
-    """s' = tanh(W*x + U*s + b), h = s' (Nayebi et al. 2022, appendix)."""
+    """Vanilla cell (Nayebi et al. 2022, appendix): s' = tanh(W*x + U*s + b), h = s'."""
 
     gates, norms = 1, 1
     elu: ClassVar[bool] = False
@@ -122,13 +122,13 @@ class VanillaCell(Cell):
 
 
 class VanillaELUCell(VanillaCell):
-    """The published code's plain cell. s' = elu(W*x + U*s + b), h = s'; its default is "-ln"."""
+    """Vanilla cell with ELU in place of tanh, from the published code. Its default is "-ln"."""
 
     elu = True
 
 
 class UGRNNCell(Cell):
-    """UGRNN (paper, appendix "UGRNN"; Collins et al. 2017).
+    """UGRNN cell (paper, appendix "UGRNN"; Collins et al. 2017).
 
     c = tanh(W_c*x + U_c*s + b_c)        g = sigmoid(W_g*x + U_g*s + b_g + 1)
     s' = g s + (1 - g) c                 h = s'
@@ -143,7 +143,7 @@ class UGRNNCell(Cell):
 
 
 class IntersectionCell(Cell):
-    """IntersectionRNN (paper, appendix "IntersectionRNN"; Collins et al. 2017).
+    """IntersectionRNN cell (paper, appendix "IntersectionRNN"; Collins et al. 2017).
 
     m = tanh(W_m*x + U_m*s + b_m)        p = sigmoid(W_p*x + U_p*s + b_p + 1)
     n = relu(W_n*x + U_n*s + b_n)        y = sigmoid(W_y*x + U_y*s + b_y + 1)
@@ -162,7 +162,7 @@ class IntersectionCell(Cell):
 
 
 class GRUCell(Cell):
-    """GRU (Nayebi et al. 2022, appendix; Cho et al. 2014).
+    """GRU cell (Nayebi et al. 2022, appendix; Cho et al. 2014).
 
     r = sigmoid(W_r*x + U_r*s + b_r + 1)     c = tanh(W_c*x + U_c*(r s) + b_c)
     u = sigmoid(W_u*x + U_u*s + b_u)         s' = u s + (1 - u) c,  h = s'
@@ -187,14 +187,14 @@ class GRUCell(Cell):
 
 
 class LSTMCell(Cell):
-    """LSTM (Nayebi et al. 2022, appendix; Hochreiter & Schmidhuber 1997).
+    """LSTM cell (Nayebi et al. 2022, appendix; Hochreiter & Schmidhuber 1997).
 
     i = sigmoid(W_i*x + U_i*h + b_i)         f = sigmoid(W_f*x + U_f*h + b_f + 1)
     j = tanh(W_j*x + U_j*h + b_j)            o = sigmoid(W_o*x + U_o*h + b_o)
     c' = f c + i j                           h' = o tanh(c')
 
-    With `layer_norm`, c' inside the last tanh is normalised too (Ba et al. 2016, equation 31). Its
-    state holds the h before the node's ReLU.
+    With `layer_norm`, c' inside the last tanh is normalised too (Ba et al. 2016, equation 31). The
+    state is (c, h), with the h before the node's ReLU.
     """
 
     gates, norms = 4, 5
@@ -211,7 +211,7 @@ class LSTMCell(Cell):
 
 
 class PublishedLSTMCell(LSTMCell):
-    """An `LSTMCell` that keeps the normalised memory, which makes it another network."""
+    """LSTM cell of the published code, whose next state is the normalised c', unlike `LSTMCell`."""
 
     keeps_normal = True
 
@@ -233,10 +233,10 @@ CELLS["lstm-ln-published"] = partial(PublishedLSTMCell, layer_norm=True)
 
 
 def make_cell(name: str, channels: int) -> Cell:
-    """Make a cell of `CELLS`, or one that another package adds.
+    """Make a cell of `CELLS`, or a cell that a plugin adds.
 
     Args:
-        name: name of the cell; of an added cell its entry point's, with or without "-ln".
+        name: name of the cell; of a plugin's cell the entry point's name, with or without "-ln".
     """
     if name in CELLS:
         return CELLS[name](channels)

@@ -1,9 +1,9 @@
-"""2 x 2 convolutions of the whisker map as matrix products.
+"""2 x 2 convolutions on the array's grid, as matrix products.
 
 Maps are `(row, column, lane, channel)`. With the sites first, the rows below a row are one block
-of memory, so a kernel's lower taps are a product of a slice. That is faster than a convolution on
-so small a map, integer kernels for it exist, and nothing is multiplied with the padding below.
-An even kernel has no centre: 'same' padding falls on the right and the bottom only.
+of memory, so a kernel's lower taps are a product with a slice. That is faster than a convolution on
+so small a map, can use integer matrix kernels, and multiplies nothing with the padding below.
+An even kernel has no centre, so 'same' padding is on the right and the bottom only.
 """
 
 from typing import Any
@@ -15,7 +15,7 @@ from torch.nn import functional as F
 
 
 class Convolution(nn.Module):
-    """2 x 2 'same' convolution of concatenated maps: Kaiming weights, zero bias."""
+    """2 x 2 'same' convolution of concatenated maps; initially Kaiming weights and zero bias."""
 
     def __init__(self, inputs: int, outputs: int) -> None:
         super().__init__()
@@ -24,22 +24,22 @@ class Convolution(nn.Module):
         nn.init.kaiming_normal_(self.weight, nonlinearity="relu")
 
     def forward(self, *maps: Tensor) -> Tensor:
-        """maps (row, column, lane, channel) each -> (row, column, lane, output)"""
+        """Concatenate maps on channels and convolve them, as the function `convolve` does."""
         return convolve(self.weight, self.bias, *maps)
 
 
 def convolve(weight: Tensor, bias: Tensor | None, *maps: Tensor) -> Tensor:
-    """Return the 'same' convolution of maps that are concatenated on channels.
+    """Concatenate maps on channels and return their 2 x 2 'same' convolution.
 
     weight  (output, 2, 2, sum of channels)
     bias    (output,) or None
-    maps    (row, column, lane, channel) each; a map of one lane stands for every lane
+    maps    (row, column, lane, channel) each; a map of one lane is broadcast to all lanes
     ->      (row, column, lane, output)
     """
     if not torch.compiler.is_compiling():
         out: Tensor = _Convolve.apply(weight, bias, *maps)  # type: ignore[no-untyped-call]
         return out
-    # The same for a graph that is traced or exported: every map has all lanes, nothing in place.
+    # For a graph that is traced or exported: every map has all lanes, and nothing is in place.
     x = torch.cat(maps, dim=-1)
     pairs = torch.cat([x, F.pad(x[:, 1:], (0, 0, 0, 0, 0, 1))], dim=-1)
     upper, lower = weight.flatten(2).unbind(1)
@@ -48,15 +48,15 @@ def convolve(weight: Tensor, bias: Tensor | None, *maps: Tensor) -> Tensor:
 
 
 def convolve_valid(weight: Tensor, bias: Tensor, x: Tensor) -> Tensor:
-    """Convolve unpadded. x (row + 1, column + 1, lane, channel) -> (row, column, lane, output)."""
+    """Convolve x unpadded. x (row + 1, column + 1, lane, channel) -> (row, column, lane, output)"""
     taps = [x[:-1, :-1], x[:-1, 1:], x[1:, :-1], x[1:, 1:]]
     return F.linear(torch.cat(taps, dim=-1), weight.flatten(1), bias)
 
 
 class _Convolve(torch.autograd.Function):
-    """`convolve` with its gradient written out, without padding or slicing copies.
+    """`convolve` with an explicit gradient, without copies for padding or slices.
 
-    Under autocast the products are in its type, the gradients of the parameters in their own.
+    Under autocast the products have autocast's type, parameter gradients the parameters' type.
     """
 
     @staticmethod
@@ -66,7 +66,7 @@ class _Convolve(torch.autograd.Function):
             dtype = torch.get_autocast_dtype(device)
         rows, columns = maps[0].shape[:2]
         lanes = max(m.shape[2] for m in maps)
-        # Every site's channels, then its right neighbour's.
+        # The channels of each site, then those of its right neighbour.
         pairs = weight.new_empty(rows, columns, lanes, 2 * channels, dtype=dtype)
         pairs[:, -1, :, channels:] = 0
         start = 0

@@ -1,9 +1,9 @@
-"""A network as data: the frame, nodes and the edges between them, feedback included.
+"""An encoder as data: a directed graph of the frame, nodes, and edges, which may form loops.
 
-Time is unrolled as in biology: a step costs every edge the same delay, so at step t a node reads
-what its predecessors put out at step t-1 (nothing at t = 0); only the frame is read at step t.
+Time is unrolled as in biology: every edge has a delay of one step, so at step t a node reads
+the outputs of its predecessors at step t-1 (zero at t = 0); only the frame is read at step t.
 
-`parse_graph` reads one from TOML::
+`parse_graph` reads a graph from TOML::
 
     readout = "fc"
     [inputs.frame]
@@ -36,7 +36,7 @@ DENSE_CELLS = ("none", "timedecay", "timedecay-ln")
 
 @dataclass(frozen=True)
 class Input:
-    """The input at every step: the frame, a map."""
+    """The network's input at every step, a frame of channels on rows and columns."""
 
     name: str
     channels: int
@@ -46,11 +46,11 @@ class Input:
 
 @dataclass(frozen=True)
 class Edge:
-    """A source that a node reads, and how it joins the node's other sources.
+    """An edge of the graph: a source of a node, and its fusion with others.
 
-    "concatenate": beside the others, on channels (the paper). "sum": projected to the channels of
-    those that are concatenated, and added. "gate": as "sum", times a learned attention per site,
-    0 to 1, computed from the concatenated maps and the added one. A vector is equal at all sites.
+    "concatenate": concatenated with the other sources on channels (the paper). "sum": projected to
+    the concatenated maps' channels and added. "gate": as "sum", times a learned attention per site,
+    0 to 1, computed from the concatenated maps and the added map. A vector is equal at all sites.
     """
 
     source: str
@@ -59,15 +59,15 @@ class Edge:
 
 @dataclass(frozen=True)
 class Node:
-    """One area: sources -> convolution -> cell -> ReLU.
+    """A node of the graph: sources -> convolution or dense layer -> cell -> ReLU.
 
     Attributes:
-        reads: The edges that the node reads, in the order of their channels; the first is
-            concatenated.
-        kind: The kind of the node: "valid" or "same", 2 x 2 convolutions of maps; "dense" reads
-            every site.
-        cell: The name of the recurrent cell: one of `CELLS`, or "none". A dense node has none or
-            time decay.
+        reads: The edges that the node reads, in the order of their channels; the fusion of the
+            first must be "concatenate".
+        kind: "valid" or "same": a 2 x 2 convolution of maps with that padding; "dense": a linear
+            layer on all sites.
+        cell: The name of the recurrent cell, one of `CELLS` or a plugin's, or "none". A dense node
+            may only have "none" or a time-decay cell.
     """
 
     name: str
@@ -79,7 +79,7 @@ class Node:
 
 @dataclass(frozen=True)
 class Graph:
-    """The frame, nodes, and the dense node that is read out."""
+    """A network's graph: the frame, the nodes, and the output node's name."""
 
     frame: Input
     nodes: tuple[Node, ...]
@@ -109,7 +109,7 @@ class Graph:
 
     @property
     def sizes(self) -> dict[str, tuple[int, int]]:
-        """Rows and columns of the frame and every node; 1 x 1 for a vector."""
+        """Rows and columns by name of frame and nodes; 1 x 1 for vectors."""
         sizes = {self.frame.name: (self.frame.rows, self.frame.columns)}
         sizes |= {node.name: (1, 1) for node in self.nodes if node.kind == "dense"}
         for _ in self.nodes:  # feedback may come from a node whose size is not known yet
@@ -135,7 +135,7 @@ class Graph:
 
     @property
     def remaining(self) -> dict[str, int]:
-        """Steps from each node to the readout; the frame has those of its nearest reader."""
+        """Length of the shortest path from each part to the readout, without frame edges."""
         distance = {self.readout: 0}
         nodes = {node.name: node for node in self.nodes}
         queue = [self.readout]
@@ -150,12 +150,12 @@ class Graph:
 
     @property
     def lag(self) -> int:
-        """Steps from the frame to the readout, by the shortest path."""
+        """Delay in steps from the frame to the readout, on the shortest path."""
         return self.remaining[self.frame.name]
 
     @property
     def components(self) -> tuple[tuple[Node, ...], ...]:
-        """Strongly connected groups of nodes, each after the groups that it reads."""
+        """Strongly connected components of nodes, in topological order."""
         reads = {n.name: {e.source for e in n.reads} for n in self.nodes}
         above = {name: set(sources) & set(reads) for name, sources in reads.items()}
         for _ in self.nodes:
@@ -170,7 +170,7 @@ class Graph:
         )
 
     def scale_channels(self, width: float) -> "Graph":
-        """Return the graph with every node's channel count times `width`."""
+        """Return the graph with every node's number of channels multiplied by `width`."""
         scale = [replace(n, channels=max(round(n.channels * width), 1)) for n in self.nodes]
         return replace(self, nodes=tuple(scale))
 
@@ -222,7 +222,7 @@ class _File(msgspec.Struct):
 
 
 def parse_graph(text: str, where: str = "graph") -> Graph:
-    """Read a graph from TOML, as in the module's docstring."""
+    """Parse the text of a TOML file (see the module's docstring) into a graph."""
     tree = parse_toml(text, where)
     file: _File = convert(tree, _File)
     for table in ("inputs", "nodes"):

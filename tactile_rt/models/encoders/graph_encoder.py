@@ -1,7 +1,7 @@
-"""Any `Graph` as a network: a whole window at once for training, or step by step.
+"""The network of any `Graph`: runs a whole window at once for training, or single steps.
 
-Inside, maps are `(row, column, lane, channel)`, vectors maps of one site; in the state a map is
-`(lane, row, column, channel)` and a vector `(lane, channel)`.
+A lane is one stream of the batch. Inside, maps are `(row, column, lane, channel)`, and vectors are
+maps of one site; in the state maps are `(lane, row, column, channel)`, vectors `(lane, channel)`.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from tactile_rt.models.encoders.graph import Graph, Input, Node, parse_graph
 
 
 class Fusion(nn.Module):
-    """The edges of a node that are summed or gated into those that are concatenated.
+    """Layer that adds a node's "sum" and "gate" sources to its concatenated sources.
 
     gate: sigmoid(w . [base, added] + b), a scalar per site and edge (gated attention).
     """
@@ -28,7 +28,7 @@ class Fusion(nn.Module):
         self.gates = nn.ModuleList(nn.Linear(2 * base, 1) if g else nn.Identity() for g in gated)
 
     def forward(self, base: Tensor, maps: Sequence[Tensor]) -> Tensor:
-        """base (row, column, lane, channel), maps of other channels each -> as base"""
+        """Add `maps`, each projected to the channels of `base` (row, column, lane, channel)."""
         out = base
         for project, gate, m in zip(self.projections, self.gates, maps, strict=True):
             added = project(m)
@@ -41,15 +41,15 @@ class Fusion(nn.Module):
 
 
 class GraphEncoder(nn.Module):
-    """Frames `(batch, step, channel, row, column)` to features.
+    """Encoder that runs a graph, from frames `(batch, step, channel, row, column)` to features.
 
     Args:
-        graph: what to build; its channel counts are final (see `Graph.scale_channels`).
+        graph: the graph, already scaled to the network's width (see `Graph.scale_channels`).
 
     Attributes:
         features: The number of channels of the graph's readout.
-        lag: The number of steps that a frame takes to reach the readout: the first `lag` steps of a
-            window cannot depend on any frame.
+        lag: The delay in steps from a frame to the readout: the first `lag` steps of a window
+            cannot depend on any frame.
     """
 
     def __init__(self, graph: Graph) -> None:
@@ -89,7 +89,7 @@ class GraphEncoder(nn.Module):
         self.features = channels[graph.readout]
 
     def initial_state(self, batch: int) -> dict[str, Tensor]:
-        """Return zeros: each node's cell state and, if a node reads it, its output ``NAME_h``."""
+        """Return zeros for each node's cell state and, if nodes read it, its output ``NAME_h``."""
         zeros = next(self.parameters()).new_zeros
         state = {}
         for node in self.graph.nodes:
@@ -101,7 +101,7 @@ class GraphEncoder(nn.Module):
     def step(
         self, frame: Tensor, index: Tensor, state: dict[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """Run one step: frame (batch, channel, row, column) -> features (batch, feature), state.
+        """Map a frame (batch, channel, row, column) to features (batch, feature) and the state.
 
         `index` is not used: the network has no positions.
         """
@@ -119,16 +119,14 @@ class GraphEncoder(nn.Module):
         return features, {key: _to_state(new[key], state[key].dim()) for key in keys}
 
     def forward(self, frames: Tensor) -> Tensor:
-        """Return the features of a whole window at once, as `step` gives them in turn.
+        """Map frames (batch, step, channel, row, column) to features (batch, step, feature).
 
-        frames (batch, step, channel, row, column) -> (batch, step, feature)
-
-        Nodes outside loops of the graph are computed for all steps in one product, and what cannot
-        reach a feature of this window is not computed. A node has one lane until the first frame
-        reaches it: until then all lanes are equal.
+        The result is the same as from `step`. Nodes outside loops of the graph are computed for all
+        steps in one product, and outputs that cannot reach a feature of this window are skipped. A
+        node has one lane until the first frame reaches it, since until then all lanes are equal.
         """
         batch, steps = frames.shape[:2]
-        # The outputs of every part of the graph, by the step in which they are read.
+        # The outputs of the frame and the nodes, indexed by the step in which they are read.
         every = _to_inside(frames.transpose(0, 1).flatten(0, 1))
         outputs = {self.graph.frame.name: list(every.split(batch, 2))}
         state = {key: _from_state(value) for key, value in self.initial_state(1).items()}
@@ -159,7 +157,7 @@ class GraphEncoder(nn.Module):
         batch: int,
         steps: int,
     ) -> None:
-        """Append all outputs of a node in no loop, computed from those of its sources."""
+        """Compute a node outside loops for all steps, and append its outputs to `outputs`."""
         steps -= self.remaining[node.name]
         if steps <= 0:
             return
@@ -181,7 +179,7 @@ class GraphEncoder(nn.Module):
             outputs[node.name].append(h)
 
     def _drive(self, node: Node, maps: Sequence[Tensor]) -> Tensor:
-        """Return the node's convolution of its sources, in the order of its edges."""
+        """Apply a node's convolution or dense layer to its sources, ordered as its edges."""
         fused = [edge.fusion != "concatenate" for edge in node.reads]
         if node.kind == "dense":
             beside = _flat([m for m, f in zip(maps, fused, strict=True) if not f])
@@ -218,7 +216,7 @@ class GraphEncoder(nn.Module):
         return F.relu(h), memory
 
     def _memory_names(self, node: Node) -> list[str]:
-        """List the state's names for the memory of a node's cell."""
+        """List the state's keys for a node's cell."""
         if node.cell == "none":
             return []
         cell = self.cells[node.name]
@@ -226,15 +224,15 @@ class GraphEncoder(nn.Module):
         return [f"{node.name}_{kind}" for kind in cell.states]
 
     def keys(self, node: Node) -> list[str]:
-        """List a node's names in the state: its cell's memory and, if read, its output."""
+        """List a node's keys in the state: its cell's and, if read, its output's."""
         return self._memory_names(node) + [f"{node.name}_h"] * (node.name in self.heard)
 
 
 @torch.no_grad()
 def draw_as_published(encoder: nn.Module) -> None:
-    """Draw first weights as the paper's code does: uniformly within +-1 / sqrt(fan-in).
+    """Draw initial weights as the paper's code does: uniformly within +-1 / sqrt(fan-in).
 
-    Biases of its cells are drawn as well; those of its convolutions stay 0, of its dense nodes 0.1.
+    Biases of cells are drawn as well; those of convolutions stay 0, those of dense nodes 0.1.
     """
     for name, part in encoder.named_modules():
         if isinstance(part, Convolution):
@@ -248,12 +246,12 @@ def draw_as_published(encoder: nn.Module) -> None:
 
 
 def _to_inside(x: Tensor) -> Tensor:
-    """(lane, channel[, row, column]) -> (row, column, lane, channel)"""
+    """Permute a frame (lane, channel[, row, column]) to (row, column, lane, channel)."""
     return x[None, None] if x.dim() == 2 else x.permute(2, 3, 0, 1)
 
 
 def _from_state(x: Tensor) -> Tensor:
-    """(lane, [row, column,] channel) -> (row, column, lane, channel)"""
+    """Permute a state (lane, [row, column,] channel) to (row, column, lane, channel)."""
     return x[None, None] if x.dim() == 2 else x.movedim(0, 2)
 
 
@@ -267,21 +265,21 @@ def _cat(maps: Sequence[Tensor]) -> Tensor:
 
 
 def _flat(maps: Sequence[Tensor]) -> Tensor:
-    """Return every site's channels, then vectors': (1, 1, lane, site * channel + ...)."""
+    """Flatten and concatenate maps, vectors last, to (1, 1, lane, site * channel + ...)."""
     sites = [m for m in maps if m.shape[:2] != (1, 1)]
     parts = [_cat(sites).movedim(2, 0).flatten(1)[None, None]] if sites else []
     return _cat(parts + [m for m in maps if m.shape[:2] == (1, 1)])
 
 
 def build_encoder(text: str, width: float, frame: tuple[int, int, int]) -> GraphEncoder:
-    """Build the encoder of a graph in TOML.
+    """Build an encoder from a graph in TOML.
 
     Args:
-        width: the factor of its channel counts.
+        width: the factor of the nodes' numbers of channels.
         frame: channels, rows and columns of the array's frames.
 
     Raises:
-        ConfigError: the text is no graph, or its frames are not the array's.
+        ConfigError: the text is no graph, or the graph's frame is not `frame`.
     """
     graph = parse_graph(text)
     read = graph.frame

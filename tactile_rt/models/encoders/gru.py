@@ -1,4 +1,4 @@
-"""A plain GRU on the whole frame: the control for the whiskers' layout and the paper's graph."""
+"""GRU encoder on the flattened frame: a control without the grid or the paper's graph."""
 
 from math import prod
 
@@ -13,9 +13,9 @@ LAYERS = 2
 
 
 class GRUEncoder(nn.Module):
-    """Frames `(batch, step, channel, row, column)` to features `(batch, step, 512 * width)`.
+    """Encoder by a two-layer GRU (Cho et al. 2014), to 512 * width features per step.
 
-    Two layers (Cho et al. 2014); 3,978,240 parameters at width 1 on the mouse's frames.
+    3,978,240 parameters at width 1 on the mouse's frames.
     """
 
     lag = 0
@@ -26,18 +26,18 @@ class GRUEncoder(nn.Module):
         self.gru = nn.GRU(prod(frame), self.features, LAYERS, batch_first=True)
 
     def forward(self, frames: Tensor) -> Tensor:
-        """Return the features (batch, step, feature) of all steps, from a zero state."""
+        """Map all frames of a window to features (batch, step, feature), from a zero state."""
         features: Tensor = self.gru(frames.flatten(2))[0]
         return features
 
     def initial_state(self, batch: int) -> dict[str, Tensor]:
-        """Return zeros: every layer's output, (batch, layer, feature)."""
+        """Return the state before the first step: zero hidden states (batch, layer, feature)."""
         return {"gru_h": self.gru.all_weights[0][1].new_zeros(batch, LAYERS, self.features)}
 
     def step(
         self, frame: Tensor, index: Tensor, state: dict[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """One step: frame (batch, channel, row, column) to features (batch, feature), new state."""
+        """Map a frame (batch, channel, row, column) to features (batch, feature) and the state."""
         x, new = frame.flatten(1), []  # (batch, number)
         for layer, h in enumerate(state["gru_h"].unbind(1)):
             w_ih, w_hh, b_ih, b_hh = self.gru.all_weights[layer]

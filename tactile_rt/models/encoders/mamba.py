@@ -1,4 +1,4 @@
-"""Mamba as an encoder: the whole frame, projected, then selective state-space blocks."""
+"""Mamba encoder: a projection of the flattened frame, then selective state-space blocks."""
 
 from math import prod
 
@@ -10,7 +10,7 @@ from tactile_rt.models.encoders.gru import FEATURES
 
 
 class MambaEncoder(nn.Module):
-    """Frames `(batch, step, channel, row, column)` to features `(batch, step, 512 * width)`.
+    """Encoder by a `MambaStack` on flattened frames, to 512 * width features per step.
 
     7,322,112 parameters at width 1 on the mouse's frames.
     """
@@ -24,16 +24,16 @@ class MambaEncoder(nn.Module):
         self.stack = MambaStack(self.features, "encoder")
 
     def forward(self, frames: Tensor) -> Tensor:
-        """Return the features (batch, step, feature) of all steps, from a zero state."""
+        """Map all frames of a window to features (batch, step, feature), from a zero state."""
         features: Tensor = self.stack(self.embed(frames.flatten(2)))
         return features
 
     def initial_state(self, batch: int) -> dict[str, Tensor]:
-        """Return zeros, as `MambaStack` does."""
+        """Return the zero state of the `MambaStack` before the first step."""
         return self.stack.initial_state(batch)
 
     def step(
         self, frame: Tensor, index: Tensor, state: dict[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """One step: frame (batch, channel, row, column) to features (batch, feature), new state."""
+        """Map a frame (batch, channel, row, column) to features (batch, feature) and the state."""
         return self.stack.step(self.embed(frame.flatten(1)), index, state)

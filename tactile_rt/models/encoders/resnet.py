@@ -1,9 +1,9 @@
-"""ResNet18 on the whisker map: the feed-forward control (He et al. 2016), time in the batch.
+"""ResNet18 on the array's grid: the feed-forward control (He et al. 2016), on each frame alone.
 
 On a 5 x 7 grid the maps shrink to 3 x 4, 2 x 2 and then 1 x 1, where most of a 3 x 3 kernel lies
-on padding: of 11,523,840 parameters only 1,914,624 can ever reach the output. Every convolution
-is therefore one product with the matrix of its taps that lie inside the map, which computes
-nothing else. Maps are `(frame, site * channel)`, sites row by row.
+on padding: of 11,523,840 parameters only 1,914,624 can ever affect the output. Every convolution
+is therefore one product with a matrix of only those taps that lie inside the map. Maps are
+`(frame, site * channel)`, sites row by row.
 """
 
 import torch
@@ -20,13 +20,13 @@ Shape = tuple[int, int]
 
 
 def output_shape(shape: Shape, kernel: int, stride: int) -> Shape:
-    """Return rows and columns after a kernel that is padded by half its size."""
+    """Return a convolution's output rows and columns, with padding of half the kernel size."""
     rows, columns = ((n + 2 * (kernel // 2) - kernel) // stride + 1 for n in shape)
     return rows, columns
 
 
 def site_taps(shape: Shape, kernel: int, stride: int) -> Tensor:
-    """Return the row-major tap (site out, site in) that joins two sites; kernel**2: none."""
+    """Return the tap index (site out, site in) that connects two sites; kernel**2: none."""
 
     def along(size_in: int, size_out: int) -> Tensor:
         centre = stride * torch.arange(size_out)[:, None]
@@ -44,7 +44,7 @@ class ConvNorm(nn.Module):
     """Convolution without bias, then batch norm.
 
     Args:
-        kernel, stride: square; padded by kernel // 2.
+        kernel, stride: the same along rows and columns; padding is kernel // 2.
     """
 
     taps: Tensor
@@ -58,20 +58,20 @@ class ConvNorm(nn.Module):
         nn.init.kaiming_normal_(self.weight, mode="fan_out", nonlinearity="relu")
 
     def forward(self, x: Tensor) -> Tensor:
-        """x (frame, site in * inputs) -> (frame, site out * outputs)"""
+        """Map x (frame, site in * inputs) to (frame, site out * outputs)."""
         y = F.linear(x, self.matrix())  # (frame, site out * outputs)
         y = self.norm(y.view(-1, len(self.weight)))  # statistics over frames and sites
         out: Tensor = y.view(len(x), -1)
         return out
 
     def matrix(self) -> Tensor:
-        """Return the taps as a matrix (site out * outputs, site in * inputs)."""
+        """Return the convolution as a matrix (site out * outputs, site in * inputs)."""
         taps = F.pad(self.weight.flatten(2).permute(2, 0, 1), (0, 0, 0, 0, 0, 1))
         matrix = taps[self.taps]  # (site out, site in, output, input)
         return matrix.transpose(1, 2).flatten(2).flatten(0, 1)
 
     def fold_norm(self) -> tuple[Tensor, Tensor]:
-        """Return matrix and bias with the norm's running statistics multiplied in."""
+        """Return one matrix and bias that equal the convolution and the trained batch norm."""
         norm = self.norm
         assert norm.running_var is not None and norm.running_mean is not None
         gain = norm.weight / torch.sqrt(norm.running_var + norm.eps)
@@ -81,7 +81,7 @@ class ConvNorm(nn.Module):
 
 
 class ResidualBlock(nn.Module):
-    """relu(x + norm(conv(relu(norm(conv(x)))))), with x projected where its shape changes."""
+    """Residual block relu(x + norm(conv(relu(norm(conv(x)))))); x is projected to a new shape."""
 
     def __init__(self, inputs: int, outputs: int, stride: int, shape: Shape) -> None:
         super().__init__()
@@ -92,17 +92,17 @@ class ResidualBlock(nn.Module):
         self.shortcut = None if same else ConvNorm(inputs, outputs, 1, stride, shape)
 
     def forward(self, x: Tensor) -> Tensor:
-        """x (frame, site in * inputs) -> (frame, site out * outputs)"""
+        """Map x (frame, site in * inputs) to (frame, site out * outputs)."""
         short = x if self.shortcut is None else self.shortcut(x)
         out: Tensor = F.relu(short + self.second(F.relu(self.first(x))))
         return out
 
 
 class _FrameEncoder(nn.Module):
-    """An encoder of each frame on its own, by `_encode`."""
+    """Base class of encoders without memory, which map each frame by `_encode`."""
 
     def forward(self, frames: Tensor) -> Tensor:
-        """frames (batch, step, channel, row, column) -> features (batch, step, feature)"""
+        """Map frames (batch, step, channel, row, column) to features (batch, step, feature)."""
         features: Tensor = self._encode(frames.flatten(0, 1)).unflatten(0, frames.shape[:2])
         return features
 
@@ -112,16 +112,16 @@ class _FrameEncoder(nn.Module):
     def step(
         self, frame: Tensor, index: Tensor, state: dict[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """One step: frame (batch, channel, row, column) to features (batch, feature), {}"""
+        """Map a frame (batch, channel, row, column) to (batch, feature), and an empty state."""
         return self._encode(frame), {}
 
     def _encode(self, frames: Tensor) -> Tensor:
-        """Encode (frame, channel, row, column) as (frame, feature)."""
+        """Map frames (frame, channel, row, column) to features (frame, feature)."""
         raise NotImplementedError
 
 
 class ResNet18Encoder(_FrameEncoder):
-    """Frames `(batch, step, channel, row, column)` to `(batch, step, 512 * width)`; no memory."""
+    """Encoder by a ResNet18 on each frame alone, to 512 * width features per step."""
 
     lag = 0
 
@@ -142,7 +142,7 @@ class ResNet18Encoder(_FrameEncoder):
         self.fc = nn.Linear(inputs, self.features)
 
     def fold_weights(self) -> "FoldedResNet18":
-        """Return its form for inference: only the taps that matter, batch norm folded in."""
+        """Return the encoder for inference: batch norm folded into matrices of the used taps."""
         return FoldedResNet18(self)
 
     def _encode(self, frames: Tensor) -> Tensor:
@@ -154,7 +154,7 @@ class ResNet18Encoder(_FrameEncoder):
 
 
 class FoldedResNet18(_FrameEncoder):
-    """A trained `ResNet18Encoder` as plain products; 2 M numbers at width 1, not 11.5 M."""
+    """A trained `ResNet18Encoder` as matrix products: 2 M weights at width 1, not 11.5 M."""
 
     lag = 0
 
@@ -186,13 +186,13 @@ class FoldedResNet18(_FrameEncoder):
 
 
 def sites_first(frames: Tensor) -> Tensor:
-    """(frame, channel, row, column) -> (frame, site * channel)"""
+    """Permute and flatten frames (frame, channel, row, column) to (frame, site * channel)."""
     return frames.flatten(2).transpose(1, 2).flatten(1)
 
 
 def maximum(x: Tensor, shape: Shape) -> Tensor:
     """Max-pool (frame, site * channel) over 3 x 3 sites, stride 2, padding 1."""
-    x = x.unflatten(1, (*shape, -1))  # not by len(x), which an export would take for fixed
+    x = x.unflatten(1, (*shape, -1))  # not by len(x), which an export would fix
     for axis in (1, 2):
         size = x.shape[axis]
         ranges = [(max(c - 1, 0), min(c + 2, size)) for c in range(0, size, 2)]

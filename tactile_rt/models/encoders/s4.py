@@ -1,17 +1,17 @@
-"""S4: structured state spaces on the whole frame (Gu, Goel & Ré 2022).
+"""S4 encoder: structured state spaces on the flattened frame (Gu, Goel & Ré 2022).
 
 Every channel is a linear system x' = A x + B u, y = C x + D u of N = 64 states, A being
-HiPPO-LegS in its normal plus low-rank form Λ - P P* (their section 3), made discrete by the
-bilinear rule. Over an episode that is a convolution with as many taps as there are steps,
+HiPPO-LegS in its normal plus low-rank form Λ - P P* (their section 3), discretised by the
+bilinear rule. Over an episode that is a convolution with as many taps as the episode has steps,
 
     K_k = C Ā^k B̄,   Ā = (I - Δ/2 A)^-1 (I + Δ/2 A),   B̄ = (I - Δ/2 A)^-1 Δ B
 
-which is computed here by running the system itself, O(N) a step by the Woodbury identity, in real
+The taps are computed by running the system itself, O(N) a step by the Woodbury identity, in real
 arithmetic: at 22 steps the paper's generating function at roots of unity saves nothing.
 
 Training: nothing bounds the last two linear layers (`out` and a decoder), so at width 1 plain SGD
-at 0.1 and AdamW at 1e-2 diverge within ten updates. It takes a clipped gradient norm with SGD, and
-at most 1e-3 with AdamW (docs/decisions/experiments.md).
+at 0.1 and AdamW at 1e-2 diverge within ten updates. SGD needs a clipped gradient norm, AdamW a
+learning rate of at most 1e-3 (docs/decisions/experiments.md).
 """
 
 import math
@@ -28,7 +28,7 @@ STATES = 64  # N, in conjugate pairs
 LAYERS = 4
 DROPOUT = 0.2
 DT_RANGE = (1e-3, 1e-1)
-# Of the time scales, A and B: decay would undo HiPPO, and dt has by far the largest gradients.
+# For dt, A and B: weight decay would undo HiPPO, and dt has by far the largest gradients.
 SSM_OPTIM = {"lr_scale": 0.1, "weight_decay": 0.0}
 
 
@@ -51,14 +51,14 @@ def hippo_legs(states: int = STATES) -> tuple[Tensor, Tensor, Tensor]:
 
 
 class S4Block(nn.Module):
-    """State spaces, GELU, GLU; then norm(x + ·) (post-norm, as the paper's code has it)."""
+    """S4 layer: state spaces, GELU, GLU, norm(x + ·). Post-norm, as in the paper's code."""
 
     def __init__(self, width: int) -> None:
         super().__init__()
         eigenvalues, p, b = hippo_legs()
 
         def parts(x: Tensor) -> nn.Parameter:
-            """(state / 2,) complex -> (channel, 2, state / 2): real parts, imaginary parts"""
+            """Split (state / 2,) complex into real and imaginary parts (channel, 2, state / 2)."""
             return nn.Parameter(torch.stack([x.real, x.imag]).float().repeat(width, 1, 1))
 
         low, high = map(math.log, DT_RANGE)
@@ -74,7 +74,7 @@ class S4Block(nn.Module):
             parameter._optim = dict(SSM_OPTIM)  # type: ignore[attr-defined]
 
     def forward(self, x: Tensor, kernel: Tensor) -> Tensor:
-        """x (batch, step, channel), convolved with kernel (channel, tap) -> the same shape"""
+        """Map x (batch, step, channel) to the same shape, given the kernel (channel, tap)."""
         steps, taps = x.shape[1], kernel.shape[1]
         kernel = kernel[:, :steps]
         padded = F.pad(kernel, (steps - 1, max(steps - taps, 0)))
@@ -82,7 +82,7 @@ class S4Block(nn.Module):
         return self.merge(x, torch.einsum("cts,bsc->btc", toeplitz, x.flip(1)))
 
     def merge(self, x: Tensor, y: Tensor) -> Tensor:
-        """Apply the part of the block after the convolution y of x, (..., channel)."""
+        """Complete the layer for x (..., channel), given the convolution's output y."""
         y = F.dropout(F.gelu(y), DROPOUT, self.training)
         y = F.dropout(F.glu(self.mix(y), -1), DROPOUT, self.training)
         out: Tensor = self.norm(x + y)
@@ -90,9 +90,9 @@ class S4Block(nn.Module):
 
 
 def kernels(blocks: Sequence[S4Block], steps: int) -> Tensor:
-    """Return every block's first `steps` taps (block, channel, step); tap 0 includes D.
+    """Compute the first `steps` taps (block, channel, step) of every block; tap 0 includes D.
 
-    All blocks at once: the recurrence is short and its vectors are small.
+    All blocks are computed at once, since the recurrence is short and its vectors are small.
     """
 
     def concatenate(name: str) -> Tensor:
@@ -134,10 +134,10 @@ def kernels(blocks: Sequence[S4Block], steps: int) -> Tensor:
 
 
 class S4Encoder(nn.Module):
-    """Frames `(batch, step, channel, row, column)` to features `(batch, step, 512 * width)`.
+    """Encoder by four S4 layers on flattened frames, to 512 * width features per step.
 
     Args:
-        taps: the steps that the convolutions reach back: an episode's.
+        taps: the number of taps of the convolutions, as many as the steps of an episode.
     """
 
     lag = 0
@@ -152,7 +152,7 @@ class S4Encoder(nn.Module):
         self.out = nn.Linear(self.features, self.features)
 
     def forward(self, frames: Tensor) -> Tensor:
-        """Return the features (batch, step, feature) of all steps, from a zero state."""
+        """Map all frames of a window to features (batch, step, feature), from a zero state."""
         x = self.embed(frames.flatten(2))  # (batch, step, channel)
         for block, kernel in zip(self.blocks, self.kernels(frames.shape[1]), strict=True):
             x = block(x, kernel)
@@ -160,23 +160,23 @@ class S4Encoder(nn.Module):
         return features
 
     def initial_state(self, batch: int) -> dict[str, Tensor]:
-        """Return zeros: every block's last inputs, newest first, (batch, layer, tap, channel)."""
+        """Return zeros for every layer's last inputs (batch, layer, tap, channel), newest first."""
         weight = self.out.weight
         return {"s4_inputs": weight.new_zeros(batch, LAYERS, self.taps, self.features)}
 
     def step(
         self, frame: Tensor, index: Tensor, state: dict[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """One step: frame (batch, channel, row, column) to features (batch, feature), new state.
+        """Map a frame (batch, channel, row, column) to features (batch, feature) and the state.
 
-        The kernels are computed anew; `fold_weights` has them ready.
+        The kernels are computed in each call; `fold_weights` computes them once.
         """
         return self.filter(frame, self.kernels(self.taps), state)
 
     def kernels(self, steps: int) -> Tensor:
-        """Return every block's kernel (layer, channel, tap) for an episode of `steps`."""
+        """Compute every layer's kernel (layer, channel, tap) for an episode of `steps` steps."""
         blocks = [block for block in self.blocks if isinstance(block, S4Block)]
-        # In single precision whatever autocast says: the state is a long product.
+        # In single precision, even under autocast: the state is a long product.
         with torch.autocast(self.out.weight.device.type, enabled=False):
             return kernels(blocks, min(steps, self.taps))
 
@@ -193,7 +193,7 @@ class S4Encoder(nn.Module):
         return self.out(x), {"s4_inputs": torch.stack(inputs, 1)}
 
     def fold_weights(self) -> "FoldedS4":
-        """Return its form for inference, with kernels computed once."""
+        """Return the encoder for inference, with kernels computed once."""
         return FoldedS4(self)
 
 
@@ -210,7 +210,7 @@ class FoldedS4(nn.Module):
             self.register_buffer("kernels", encoder.kernels(encoder.taps))
 
     def forward(self, frames: Tensor) -> Tensor:
-        """frames (batch, step, channel, row, column) -> features (batch, step, feature)"""
+        """Map frames (batch, step, channel, row, column) to features (batch, step, feature)."""
         features: Tensor = self.encoder(frames)
         return features
 
@@ -220,11 +220,11 @@ class FoldedS4(nn.Module):
     def step(
         self, frame: Tensor, index: Tensor, state: dict[str, Tensor]
     ) -> tuple[Tensor, dict[str, Tensor]]:
-        """One step: frame (batch, channel, row, column) to features (batch, feature), new state."""
+        """Map a frame (batch, channel, row, column) to features (batch, feature) and the state."""
         return self.encoder.filter(frame, self.kernels, state)
 
 
 def product(a: Tensor, b: Tensor) -> Tensor:
-    """Multiply complex numbers stored as (..., 2, state): real parts, imaginary parts."""
+    """Multiply complex arrays that are stored as (..., 2, state): real and imaginary parts."""
     (a_re, a_im), (b_re, b_im) = a.unbind(-2), b.unbind(-2)
     return torch.stack([a_re * b_re - a_im * b_im, a_re * b_im + a_im * b_re], -2)

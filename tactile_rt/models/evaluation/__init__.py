@@ -1,1 +1,1 @@
-"""Evaluation of a model on objects that it never saw: accuracy, robustness, open set."""
+"""Evaluation of a model on unseen objects: accuracy, robustness, open set."""

@@ -1,4 +1,4 @@
-"""Measured coverage and refusals of a model file, to compare with those that it states."""
+"""Measurement of a model file's coverage and refusals, to compare with the stated coverage."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -16,22 +16,22 @@ from tactile_rt.models.evaluation import measures
 from tactile_rt.models.evaluation.measures import Floats, Interval, Labels, run_steps
 from tactile_rt.models.implausible import IMPLAUSIBLE
 
-NAMES_LEFT = "names at the last step"  # a number, where the others are shares
+NAMES_LEFT = "names at the last step"  # a mean number of names; the other results are shares
 Doubles = NDArray[np.float64]
 NOTHING = Interval(float("nan"), float("nan"), float("nan"))
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """The coverage and the refusals of a model on a test.
+    """Measured coverage and rates of refusal of a model on test sweeps.
 
     Attributes:
         nominal: The coverage that the model file states, 0 to 1; NaN without prediction sets.
-        covered: The share of sweeps whose true class is in the prediction set of every step, of
-            those of known classes in which a contact was found.
+        covered: The share of sweeps whose true class is in the prediction set at every step, among
+            sweeps with a detected contact.
         size: The mean number of classes in the prediction set at the last step of these sweeps.
-        unknown: The share of sweeps that the model calls unknown.
-        faulty: The share of sweeps that the model refuses for faulty loads.
+        unknown: The share of all sweeps that the model decides are unknown.
+        faulty: The share of all sweeps that the model refuses because of faulty loads.
     """
 
     nominal: float
@@ -44,17 +44,16 @@ class Coverage:
 def measure_names(
     path: Path, test: SweepSet, disturbance: Disturbance = CLEAN
 ) -> Iterator[tuple[str, Interval]]:
-    """Measure the prediction sets of kinds; yield nothing if model or test has no kinds.
+    """Measure the prediction sets of kinds within the true class of each test sweep.
 
-    The coverage of a class is the share of sweeps whose kind is in the prediction set of their
-    class at every step, of the sweeps of kinds that the model knows. Classes of one kind are left
-    out.
+    The coverage of a class is the share of its sweeps whose kind is in the class's prediction set
+    at every step. Sweeps of kinds unknown to the model, and classes of one kind, are left out.
 
     Args:
         test: the sweeps, labelled by the model's classes; sweeps without a contact are left out.
 
     Yields:
-        The name of a figure, and the figure.
+        The name of a result and its value; nothing if the model or the test has no kinds.
     """
     session, card = load_model(path)
     rules = {name: fitting(own, disturbance.noise) for name, own in card.names.items()}
@@ -95,10 +94,10 @@ def measure_names(
 def measure_coverage(
     path: Path, test: SweepSet, disturbance: Disturbance = CLEAN
 ) -> Coverage | None:
-    """Measure coverage and refusals on a test; None for a model without either.
+    """Measure coverage and refusals on test sweeps; return None for a model without either.
 
     Args:
-        test: the sweeps, labelled by the model's classes; with sweeps of no class (-1), only
+        test: the sweeps, labelled by the model's classes; if any sweep is of no class (-1), only
             refusals are measured.
     """
     _, card = load_model(path)
@@ -132,8 +131,8 @@ def _measure_sets(rule: PredictionSetRule, posteriors: Floats, labels: Labels) -
         posteriors, labels: (sweep, step, class) and (sweep,).
 
     Returns:
-        (3, sweep) whether the label is in the set of every step, whether it comes first in the
-        last set, and the size of the last set.
+        (3, sweep): 1 if the label is in the set at every step, 1 if the label is first in the last
+        set, and the size of the last set.
     """
     rows = []
     for p, label in zip(posteriors, labels.tolist(), strict=True):
@@ -143,10 +142,10 @@ def _measure_sets(rule: PredictionSetRule, posteriors: Floats, labels: Labels) -
 
 
 def score_known(path: Path, test: SweepSet) -> Floats:
-    """Return (sweep,) open-set scores: how probable a known class is to a model.
+    """Return open-set scores (sweep,): a model's probability that the object is known.
 
-    The score is the posterior of all labels but `unknown`; for a model without that label, that
-    of the most probable class. 0 where no contact was found.
+    The score is the posterior of all labels but "unknown"; for a model without that label, the
+    posterior of the most probable class. It is 0 where no contact was detected.
     """
     _, card = load_model(path)
     last = _predict_all(path, test, CLEAN)[:, -1]
@@ -158,9 +157,9 @@ def score_known(path: Path, test: SweepSet) -> Floats:
 
 
 def named_faults(path: Path, test: SweepSet) -> Iterator[tuple[str, Interval]]:
-    """Measure the share of sweeps with each implausible fault that a model refuses as faulty.
+    """Measure how often a model refuses sweeps as faulty, for each implausible fault.
 
-    Only faults that the model has a label for are measured.
+    Only faults that the model has a label for are measured. Yields the fault and the share.
     """
     _, card = load_model(path)
     faults = [name for name in card.refusals if name in IMPLAUSIBLE]
@@ -173,12 +172,12 @@ def named_faults(path: Path, test: SweepSet) -> Iterator[tuple[str, Interval]]:
 
 
 def _predict_all(path: Path, test: SweepSet, disturbance: Disturbance) -> Floats:
-    """Return posteriors (sweep, step, label) of all labels, refusals last."""
+    """Run a model file on test sweeps; return posteriors (sweep, step, label), refusals last."""
     run = run_steps(*load_model(path), refusals=True)
     return measures.predict(test, run, disturbance=disturbance)
 
 
 def _decide(card: ModelCard, posteriors: Floats) -> NDArray[np.str_]:
-    """Return (sweep,) labels decided at the last step; "" where no contact was found."""
+    """Return the label (sweep,) decided from each posterior; "" where no contact was detected."""
     found = [None if np.isnan(p).any() else choose_label(card, p, card.steps) for p in posteriors]
     return np.array(["" if k is None else card.labels[k] for k in found])

@@ -1,10 +1,10 @@
-"""Measures of a classifier on objects that it never saw, with intervals by object.
+"""Performance measures of a classifier on unseen objects, with intervals bootstrapped by object.
 
 The sweeps may be disturbed first (`disturbances`). Sweeps of one object are not independent, so
-intervals resample objects.
+intervals resample objects, not sweeps.
 
-Predictions are (sweep, step, class) posteriors; a sweep in which no contact was detected has no
-decision, and counts as wrong everywhere.
+Predictions are posteriors (sweep, step, class). A sweep without a detected contact has no
+decision, and counts as wrong in accuracies.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -35,13 +35,12 @@ LEVELS = (2.5, 97.5)  # percentiles of the 95 % interval
 
 @dataclass(frozen=True)
 class CutWindows:
-    """Windows of some sweeps, and the detector's baseline at their onsets.
+    """Windows cut from a batch of sweeps, with the detector's baseline at their onsets.
 
     Attributes:
-        samples: The (sweep, step, sub-step, element, channel) samples of the windows, SI.
-        offset, sigma: The (sweep, element, channel) mean and noise at rest, SI.
-        detected: The (sweep,) flags whether a contact was detected; where it was not, the samples
-            mean nothing.
+        samples: (sweep, step, sub-step, element, channel) The samples of the windows, SI.
+        offset, sigma: (sweep, element, channel) The mean and noise at rest, SI.
+        detected: (sweep,) True if a contact was detected; otherwise the samples are meaningless.
     """
 
     samples: Floats
@@ -69,15 +68,15 @@ def predict(
     seed: int = 0,
     disturbance: Disturbance = CLEAN,
 ) -> Floats:
-    """Return the posteriors of every sweep at every step from its detected onset.
+    """Compute the posteriors of every sweep at every step from its detected onset.
 
     Args:
-        run: (samples, offset, sigma) of windows to (batch, step, class) logits.
+        run: function of (samples, offset, sigma) that returns logits (batch, step, class).
         noise_level: white sensor noise added to every stored sample, in units of the rated noise;
-            short for a `disturbance` of only that.
+            if not 0, it replaces the noise of `disturbance`.
 
     Returns:
-        (sweep, step, class) posteriors; NaN where no contact was detected.
+        Posteriors (sweep, step, class); NaN where no contact was detected.
     """
     if noise_level:
         disturbance = replace(disturbance, noise=noise_level)
@@ -85,7 +84,7 @@ def predict(
 
 
 def posteriors(cut: Iterable[CutWindows], run: Step) -> Floats:
-    """Return (sweep, step, class) posteriors of windows; NaN without contact or on overflow."""
+    """Compute posteriors (sweep, step, class) of windows; NaN without contact or on overflow."""
     logits, found = run_over(cut, run)
     with np.errstate(invalid="ignore"):
         posterior = softmax(logits)
@@ -96,7 +95,7 @@ def posteriors(cut: Iterable[CutWindows], run: Step) -> Floats:
 def cut_windows(
     data: SweepSet, seed: int = 0, batch: int = 64, disturbance: Disturbance = CLEAN
 ) -> Iterator[CutWindows]:
-    """Yield the windows of all sweeps, cut as on the robot, `batch` at a time."""
+    """Disturb all sweeps and yield their windows from the detected onset, `batch` at a time."""
     rng = np.random.default_rng(seed)
     for i in range(0, len(data.sweeps), batch):
         part = data[i : i + batch]
@@ -107,10 +106,10 @@ def cut_windows(
 
 
 def run_over(cut: Iterable[CutWindows], run: Step) -> tuple[Floats, NDArray[np.bool_]]:
-    """Run a function on windows; return its outputs and (sweep,) whether contact was detected.
+    """Run a function on windows; return its outputs and a mask (sweep,) of detected contacts.
 
     Args:
-        run: as `predict` takes it; its outputs need not be logits.
+        run: function of (samples, offset, sigma) of windows, as for `predict`, with any output.
     """
     parts = [(run(one.samples, one.offset, one.sigma), one.detected) for one in cut]
     out, detected = zip(*parts, strict=True)
@@ -118,20 +117,20 @@ def run_over(cut: Iterable[CutWindows], run: Step) -> tuple[Floats, NDArray[np.b
 
 
 def at_temperature(posteriors: Floats, temperature: float) -> Floats:
-    """Return (..., class) posteriors with their logits divided by a temperature."""
+    """Rescale posteriors (..., class) by dividing their logits by a temperature."""
     with np.errstate(divide="ignore"):
         logits = np.log(posteriors) / np.float32(temperature)
     return softmax(logits)
 
 
 def softmax(logits: NDArray[Any]) -> Floats:
-    """Turn (..., class) logits into posteriors."""
+    """Return the posteriors (..., class) of logits (..., class)."""
     raised = np.exp(logits - logits.max(axis=-1, keepdims=True))
     return np.asarray(raised / raised.sum(axis=-1, keepdims=True))
 
 
 def among(posteriors: Floats, classes: int) -> Floats:
-    """Return (..., class) posteriors given that the label is one of the first `classes`."""
+    """Condition posteriors (..., label) on the first `classes` labels; return (..., class)."""
     own = posteriors[..., :classes]
     return np.asarray(own / np.maximum(own.sum(axis=-1, keepdims=True), 1e-30))
 
@@ -142,17 +141,17 @@ def split_by_class(
     numbers: Labels,
     kinds: Mapping[str, Sequence[str]],
 ) -> Iterator[tuple[str, Labels, Floats, Labels]]:
-    """Split sweeps by class, with posteriors of the kinds of that class alone.
+    """Split sweeps by their true class and compute posteriors of the kinds within that class.
 
     Args:
-        logits: (sweep, step, name) of the kinds of all classes.
-        found: (sweep,) whether a contact was detected.
-        numbers: (sweep,) the true kind, as `SweepSet.kinds` counts them.
+        logits: (sweep, step, name) logits of the kinds of all classes.
+        found: (sweep,) True if a contact was detected.
+        numbers: (sweep,) number of the true kind, as from `SweepSet.kinds`.
         kinds: the kinds of each class.
 
     Yields:
-        The class, the indices of sweeps of its kinds, their posteriors (sweep, step, kind), NaN
-        where no contact was detected, and their kinds (sweep,), counted within the class.
+        The class, the indices of its sweeps, their posteriors (sweep, step, kind), NaN where no
+        contact was detected, and their true kinds (sweep,), numbered within the class.
     """
     for name, columns in kind_columns(kinds).items():
         at = np.flatnonzero((numbers >= columns.start) & (numbers < columns.stop))
@@ -163,20 +162,20 @@ def split_by_class(
 
 
 def hits(posteriors: Floats, labels: Labels, top: int = 1) -> NDArray[np.bool_]:
-    """Return (sweep,) whether the label is among the `top` classes of (sweep, class)."""
+    """Return a mask (sweep,) of labels among the `top` most probable classes; NaN: False."""
     decided = ~np.isnan(posteriors).any(axis=1)
     order = np.argsort(-np.nan_to_num(posteriors), axis=1, kind="stable")[:, :top]
     return np.asarray(decided & (order == labels[:, None]).any(axis=1))
 
 
 def auroc(known: Floats, unknown: Floats) -> float:
-    """Return the chance that a known category's sweep scores higher than an unknown one's.
+    """Return the area under the ROC curve of scores for known against unknown objects.
 
     Args:
         known, unknown: (sweep,) scores; NaN, where no contact was detected, is the lowest.
 
     Returns:
-        The chance; NaN without sweeps of either kind.
+        The probability that a known sweep has the higher score; NaN if there is only one group.
     """
     if not len(known) or not len(unknown):
         return float("nan")
@@ -187,7 +186,7 @@ def auroc(known: Floats, unknown: Floats) -> float:
 
 
 def open_set(known: Floats, objects: Names, unknown: Floats, others: Names) -> Interval:
-    """Measure the open-set AUROC of scores (sweep,) of known objects against unknown ones."""
+    """Measure the open-set AUROC, with interval, from scores (sweep,) and object names (sweep,)."""
     scores = np.concatenate([known, unknown])
 
     def area(at: Labels) -> float:
@@ -198,22 +197,20 @@ def open_set(known: Floats, objects: Names, unknown: Floats, others: Names) -> I
 
 
 def deciding_step(posteriors: Floats, labels: Labels) -> NDArray[np.int64]:
-    """Return (sweep,) the step, from 1, since which the decision stays right; 0: never.
+    """Return the step (sweep,) from which the decision stays right until the window's end.
 
-    Args:
-        posteriors: (sweep, step, class).
-        labels: (sweep,).
+    Steps count from 1; 0 if the last decision is wrong. Posteriors are (sweep, step, class).
     """
     steps = posteriors.shape[1]
     right = np.stack([hits(posteriors[:, t], labels) for t in range(steps)], axis=1)
-    kept = np.logical_and.accumulate(right[:, ::-1], axis=1).sum(axis=1)  # right steps at the end
+    kept = np.logical_and.accumulate(right[:, ::-1], axis=1).sum(axis=1)  # final right steps
     return np.where(kept > 0, steps - kept + 1, 0).astype(np.int64)
 
 
 def fused_accuracy(posteriors: Floats, labels: Labels, objects: Names, sweeps: int = 2) -> Interval:
-    """Measure the accuracy of (sweep, class) posteriors fused over an object's successive sweeps.
+    """Measure the accuracy of posteriors (sweep, class) fused over successive sweeps of an object.
 
-    An undetected sweep contributes nothing; a group of only such sweeps is wrong.
+    A sweep without contact contributes nothing; a group of only such sweeps counts as wrong.
     """
     correct, of = [], []
     for name in np.unique(objects):
@@ -226,7 +223,7 @@ def fused_accuracy(posteriors: Floats, labels: Labels, objects: Names, sweeps: i
 
 
 def confusion(posteriors: Floats, labels: Labels, classes: int) -> NDArray[np.int64]:
-    """Count the decided sweeps by (true class, decided class)."""
+    """Return the confusion matrix (true class, decided class) of sweeps with a decision."""
     decided = ~np.isnan(posteriors).any(axis=1)
     table = np.zeros((classes, classes), dtype=np.int64)
     np.add.at(table, (labels[decided], posteriors[decided].argmax(axis=1)), 1)
@@ -247,12 +244,12 @@ def expected_calibration_error(posteriors: Floats, labels: Labels, bins: int = 1
 
 
 def accuracy(correct: NDArray[Any], objects: Names, resamples: int = 2000) -> Interval:
-    """Return a mean over sweeps with a percentile bootstrap over objects.
+    """Return the mean over sweeps with a percentile bootstrap interval over objects.
 
     Args:
-        correct: (sweep,) whether each was right; or the difference of two such arrays, for the
-            points that one condition loses to another on the same sweeps; or (seed, sweep), whose
-            seeds are then resampled too.
+        correct: (sweep,) True if the decision is right; or the difference of two such arrays, to
+            compare two conditions on the same sweeps; or (seed, sweep), and then seeds are
+            resampled too.
         objects: (sweep,) object of each sweep.
     """
     runs = np.atleast_2d(correct).astype(np.float64)
@@ -273,11 +270,11 @@ def accuracy(correct: NDArray[Any], objects: Names, resamples: int = 2000) -> In
 def bootstrap(
     statistic: Callable[[NDArray[np.int64]], float], objects: Names, resamples: int = 300
 ) -> Interval:
-    """Return any statistic of sweeps with a percentile bootstrap over objects.
+    """Return a statistic of all sweeps with a percentile bootstrap interval over objects.
 
     Args:
-        statistic: of the sweeps with given indices (k,), which may repeat; NaN where it is
-            undefined, as for a draw without one of two kinds.
+        statistic: function of sweep indices (k,), which may repeat; returns NaN where it is
+            undefined, for example for a resample of only known objects.
         objects: (sweep,) object of each sweep.
     """
     _, which = np.unique(objects, return_inverse=True)
@@ -292,10 +289,10 @@ def bootstrap(
 
 
 def macro_accuracy(correct: NDArray[np.bool_], labels: Labels, objects: Names) -> Interval:
-    """Average the accuracies of all classes; `accuracy` is the mean over sweeps.
+    """Return the mean of the classes' accuracies, with a bootstrap interval over objects.
 
     Args:
-        correct, labels, objects: (sweep,) whether each was right, its class and its object.
+        correct, labels, objects: (sweep,) True if right, the true class, and the object.
     """
 
     def mean(at: Labels) -> float:
@@ -307,8 +304,8 @@ def macro_accuracy(correct: NDArray[np.bool_], labels: Labels, objects: Names) -
 
 
 def run_on(model: "TactileClassifier", output: str = "logits") -> Step:
-    """Wrap a torch model as a function for `predict`, or one with another output."""
-    import torch  # here: a model file is measured without it
+    """Return a function for `predict` that computes one output of a torch model."""
+    import torch  # imported here, since a model file is measured without torch
 
     def run(*loads: Floats) -> Floats:
         model.eval()
@@ -325,15 +322,15 @@ def run_on(model: "TactileClassifier", output: str = "logits") -> Step:
 
 
 def run_steps(session: ort.InferenceSession, card: ModelCard, refusals: bool = False) -> Step:
-    """Wrap a model file, as `load_model` gives it, as a function for `predict`.
+    """Return a function for `predict` that runs a model file loaded by `load_model`.
 
     Args:
-        refusals: whether the logits include those of the refusals. Without them, a posterior is
+        refusals: True if the logits include those of the refusals. Without them, posteriors are
             conditional on the model naming a class.
 
     Returns:
-        (samples, offset, sigma) of windows to (batch, step, class) logits, divided by the
-            temperature.
+        A function of (samples, offset, sigma) of windows that returns logits (batch, step, label),
+        divided by the temperature.
     """
     divisor = np.float32(card.temperature)
     kept = len(card.labels) if refusals else len(card.classes)

@@ -1,7 +1,7 @@
-"""Figures of a model file on objects that it never saw, as `tactile-rt eval` shows them.
+"""Evaluation of a model file on unseen objects, for `tactile-rt eval`.
 
 The model runs as on a robot: the ONNX file itself, step by step, from the onset that the contact
-detector finds.
+detector reports.
 """
 
 from dataclasses import replace
@@ -30,13 +30,13 @@ from tactile_rt.models.evaluation.records import Record, record_count, record_sh
 from tactile_rt.models.evaluation.robustness import measure_robustness, rated_amount
 from tactile_rt.sets.manifest import WITHHELD
 
-# By the number of classes: of the shipped recipes `mouse12` and `default24`.
+# By number of classes, for the shipped recipes `mouse12` and `default24`.
 BARS = {
     12: {"top-1": ">= 91", "top-5": ">= 99", "fused": ">= 97"},
     24: {"top-1": ">= 82", "top-5": ">= 97", "fused": ">= 96", "noise": "<= 4"},
 }
 ECE_BAR = "<= 5"
-# Sweeps of each object, enough for a long list of conditions on the same sweeps.
+# Sweeps per object: few, since robustness is measured under many conditions.
 ROBUSTNESS_SWEEPS, QUICK_SWEEPS = 4, 2
 
 
@@ -50,14 +50,14 @@ def evaluate_model(
     """Measure a model on the test split of a sweep set.
 
     Args:
-        svm: fit an RBF support vector machine on the same windows to compare with.
+        svm: compare with an RBF support vector machine that is fitted to the same windows.
         pictures: folder for ``confusion.png`` and ``accuracy_over_time.png``.
-        quick: take two sweeps of each object: enough to compare by, not to quote.
+        quick: use two sweeps of each object: enough for comparisons, not for publication.
 
     Raises:
-        ConfigError: the model was trained on some of the test objects, does not know all of their
-            categories, or another sample period.
-        SpecMismatch: the model was made for another array than a set's.
+        ConfigError: the model may have been trained on test objects, does not know all of their
+            categories, or has another sample period.
+        SpecMismatch: the model was made for another array.
     """
     session, card = load_model(model)
     run = run_steps(session, card)
@@ -70,7 +70,7 @@ def evaluate_model(
     sample = f"{len(set(objects.tolist()))} unseen objects, {len(labels)} sweeps"
 
     clean = measures.predict(test, run)
-    # bars are for objects of the training's source
+    # the bars apply to test objects from the same source as the training objects
     bars = {} if _has_other_source(test, card) else BARS.get(len(card.classes), {})
 
     def top(name: str, posteriors: Floats, how: str = sample, top: int = 1) -> Record:
@@ -145,7 +145,7 @@ def evaluate_model(
 
 
 def _read_test(data: Path, card: ModelCard, model: Path, quick: bool) -> SweepSet:
-    """Read a set's test split with the labels and the window of a model."""
+    """Read a set's test split, with labels numbered and windows cut as for a model."""
     test, known = SweepSet.read(data, "test"), card.classes
     differences = card.array.differences(test.manifest.spec, ignore=("name", "rate_hz"))
     if differences:
@@ -172,7 +172,7 @@ def _read_test(data: Path, card: ModelCard, model: Path, quick: bool) -> SweepSe
 
 
 def _may_know_objects(card: ModelCard, test: SweepSet) -> bool:
-    """Return whether the model was, or may have been, trained on objects of the test."""
+    """Return whether the model may have been trained on objects of the test."""
     names = set(test.sweeps.objects.tolist())
     trained = card.provenance.get("trained_objects")
     if isinstance(trained, dict):
@@ -182,7 +182,7 @@ def _may_know_objects(card: ModelCard, test: SweepSet) -> bool:
 
 
 def _has_other_source(test: SweepSet, card: ModelCard) -> bool:
-    """Return whether the objects come from another source than the model's training."""
+    """Return whether the test objects come from another source than the training objects."""
     trained: Any = card.provenance.get("sweep_set", {})
     source = trained.get("objects", {}).get("from") if isinstance(trained, dict) else None
     return source is not None and test.manifest.recipe.get("objects", {}).get("from") != source
@@ -272,7 +272,7 @@ def _take_first_sweeps(data: SweepSet, sweeps: int) -> SweepSet:
 def _compare_svm(
     data: Path, card: ModelCard, test: SweepSet, network: NDArray[np.bool_]
 ) -> list[Record]:
-    """Compare a network's hits (sweep,) with an RBF SVM on the same windows."""
+    """Compare a network's hits (sweep,) with those of an RBF SVM on the same windows."""
     from tactile_rt.models.evaluation.svm import fit_svm  # scikit-learn takes a second to import
 
     learnt_from = (  # with the model's labels, as the test has

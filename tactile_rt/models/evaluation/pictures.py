@@ -12,8 +12,8 @@ from tactile_rt.models.evaluation import measures
 def draw_confusion(table: NDArray[np.int64], labels: tuple[str, ...], path: Path) -> None:
     """Draw a confusion matrix (true, decided) as percentages of each true class.
 
-    Rows are the classes with sweeps; columns are the same classes, then those that were decided but
-    have no sweeps.
+    Rows are the classes with test sweeps; columns are the same classes, then other classes that
+    were decided.
     """
     there, decided = table.sum(axis=1) > 0, table.sum(axis=0) > 0
     rows = np.flatnonzero(there)
@@ -46,13 +46,13 @@ def draw_over_time(
     step_ms: float,
     path: Path,
 ) -> None:
-    """Draw top-1 against the time since the first touch, with 95 % intervals by object.
+    """Draw top-1 accuracy over the time since first touch, with 95 % intervals by object.
 
     Args:
-        curves: (sweep, step, class) posteriors by name.
-        labels: (sweep,).
+        curves: posteriors (sweep, step, class) of each curve, by the curve's name.
+        labels: (sweep,) true classes.
         objects: (sweep,) names.
-        step_ms: the time that a step takes, ms.
+        step_ms: the duration of a step, ms.
     """
     figure = Figure(figsize=(7.2, 3.8), layout="constrained")
     axes = figure.subplots()

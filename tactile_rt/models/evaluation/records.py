@@ -1,4 +1,4 @@
-"""Benchmark figures: one record per figure, one table, one JSON form."""
+"""Benchmark results: one record per result, shown as a table or written as JSON."""
 
 import json
 import operator
@@ -18,11 +18,11 @@ COMPARISONS = {"<=": operator.le, ">=": operator.ge, "==": operator.eq}
 
 @dataclass(frozen=True)
 class Record:
-    """One measured figure.
+    """One benchmark result: a measured value, its unit, and the limit that it must meet.
 
     Attributes:
-        bar: The limit that the figure must meet, e.g. ``>= 91``; empty: it is only reported.
-        anchor: What the bar or figure is compared to, or where the bar comes from.
+        bar: The limit that the value must meet, e.g. ``>= 91``; empty: the value is only reported.
+        anchor: The context of the value or bar: an interval, a reference, or the bar's origin.
         how: The conditions of the measurement: sample, interval, machine.
     """
 
@@ -35,7 +35,7 @@ class Record:
 
     @property
     def met(self) -> bool | None:
-        """True if the figure meets its bar, False if not, None without a bar."""
+        """True if the value meets its bar, False if not, None without a bar."""
         if not self.bar:
             return None
         sign, _, limit = self.bar.partition(" ")
@@ -45,19 +45,19 @@ class Record:
 def record_share(
     name: str, estimate: "Interval", bar: str, how: str, unit: str = "%", beside: str = ""
 ) -> Record:
-    """Return a share as a figure of a model in percent, with its interval."""
+    """Return a `Record` of a model's share (0 to 1), in percent, with its interval."""
     interval = f"95 % interval {100 * estimate.low:.1f} to {100 * estimate.high:.1f}, by object"
     return Record(f"models.{name}", 100 * estimate.value, unit, bar, interval + beside, how)
 
 
 def record_count(name: str, estimate: "Interval", how: str) -> Record:
-    """Return a mean number as a figure of a model, with its interval."""
+    """Return a `Record` of a model's mean number, with its interval."""
     interval = f"95 % interval {estimate.low:.1f} to {estimate.high:.1f}, by object"
     return Record(f"models.{name}", estimate.value, "", "", interval, how)
 
 
 def as_table(records: list[Record]) -> Table:
-    """Return records as a table, each with its measurement's conditions on the line below."""
+    """Format records as a table, with each measurement's conditions on a second line."""
     table = Table("figure", "value", "bar", "met", leading=1)
     table.columns[0].overflow = "fold"  # a name is one long word
     for column in table.columns[1:]:
@@ -71,15 +71,15 @@ def as_table(records: list[Record]) -> Table:
 
 
 def as_dicts(records: list[Record]) -> list[dict[str, Any]]:
-    """Return records as JSON values, each with whether it meets its bar."""
+    """Return records as JSON objects; "met" says whether the value meets its bar."""
     return [{**asdict(r), "met": r.met} for r in records]
 
 
 def show(records: list[Record], console: Console) -> None:
-    """Print records as a table."""
+    """Print records as a table on a console."""
     console.print(as_table(records))
 
 
 def write(records: list[Record], path: Path) -> None:
-    """Write records as JSON."""
+    """Write records to a JSON file."""
     path.write_text(json.dumps(as_dicts(records), indent=1) + "\n")

@@ -8,11 +8,11 @@ from tactile_rt.models.disturbances import OFFSET, Disturbance
 from tactile_rt.models.evaluation import measures
 from tactile_rt.models.evaluation.records import Record, record_share
 
-REST = 80  # samples at rest for the baseline, 0.7 s of a mouse's
+REST = 80  # samples at rest for the baseline, 0.7 s at the mouse array's period
 
 
 def rated_amount(data: SweepSet, factor: float = 1.0) -> str:
-    """Return the rated noise per sample, or a multiple, as text, e.g. 10 uN and 0.05 uN m."""
+    """Format `factor` times the rated noise per sample, e.g. "10 uN and 0.05 uN m"."""
     largest: dict[str, float] = {}
     for unit, noise in zip(data.manifest.spec.units, data.noise.tolist(), strict=True):
         largest[unit] = max(largest.get(unit, 0.0), noise)
@@ -20,7 +20,7 @@ def rated_amount(data: SweepSet, factor: float = 1.0) -> str:
 
 
 def conditions(data: SweepSet) -> dict[str, Disturbance]:
-    """Return the disturbances to test by name; the name states amounts for the set's sensor."""
+    """Return the disturbances to test, by names that state amounts for the set's sensor."""
     rated, whiskers = rated_amount(data), len(data.manifest.spec.elements)
     found = {
         "noise at a quarter of the rated": Disturbance(noise=0.25),
@@ -49,10 +49,10 @@ def conditions(data: SweepSet) -> dict[str, Disturbance]:
 def measure_robustness(
     test: SweepSet, run: measures.Step, clean: NDArray[np.float32]
 ) -> list[Record]:
-    """Measure accuracy under every condition, and the points lost on the same sweeps.
+    """Measure accuracy under every disturbance, and the loss against undisturbed sweeps.
 
     Args:
-        clean: (sweep, class) final posteriors of the same sweeps, undisturbed.
+        clean: (sweep, class) posteriors at the last step of the same sweeps, undisturbed.
     """
     labels, objects = test.sweeps.labels, test.sweeps.objects
     base = measures.hits(clean, labels).astype(np.float64)

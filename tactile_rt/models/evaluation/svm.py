@@ -1,12 +1,12 @@
-"""RBF support vector machines, all of them fitted here, for two comparisons.
+"""RBF support vector machines, as baselines for networks and for the card of a sweep set.
 
-`fit_svm` gives a machine to compare a network with on the same windows: it takes the same onsets,
-baseline and compression, and the validation split chooses its penalty.
-The card of a sweep set shows whether the set can be learnt from at all, with features and a penalty
+`fit_svm` fits a machine to compare a network with on the same windows: with the same onsets,
+baseline and compression, and a penalty chosen on the validation split.
+The card of a sweep set reports whether the set can be learnt at all, with features and a penalty
 of its own (`tactile_rt.sim_backend.datasets.card_survey`); the command passes `fit` to it, since
 simulation and networks do not import each other.
 
-Standardising the features only makes the machine worse, so nothing here does.
+Features are not standardised, since that lowers the accuracy.
 """
 
 from collections.abc import Callable
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from tactile_rt.models.datasets import SweepSet
     from tactile_rt.models.disturbances import Disturbance
 
-MOST_PAIRED = 8000  # sweeps whose kernel, 8 bytes a pair, is kept: half a gigabyte
+MOST_PAIRED = 8000  # most sweeps with a precomputed kernel, 8 bytes a pair: half a gigabyte
 PENALTIES = (1.0, 10.0, 100.0, 300.0)  # C
 
 Floats = NDArray[np.float32]
@@ -32,7 +32,7 @@ Floats = NDArray[np.float32]
 
 @dataclass(frozen=True)
 class FittedSVM:
-    """A fitted machine; called with (sweep, feature) values, it decides their (sweep,) labels."""
+    """A fitted support vector machine; a call maps features (sweep, feature) to labels (sweep,)."""
 
     machine: SVC
     kernel: Callable[[Floats], Floats]
@@ -42,26 +42,25 @@ class FittedSVM:
         return np.asarray(self.machine.predict(self.kernel(features)))
 
     def margins(self, features: Floats, classes: int) -> NDArray[np.float64]:
-        """Return each of `classes` classes' distances from its boundary with all others.
+        """Return the decision value (sweep, class) of each class against all others.
 
-        Returns:
-            (sweep, class); -inf for a class without training sweeps.
+        It is -inf for a class without training sweeps.
         """
         found = np.full((len(features), classes), -np.inf)
         distance = self.machine.decision_function(self.kernel(features))
-        if distance.ndim == 1:  # two classes: that of the second
+        if distance.ndim == 1:  # with two classes, only the second's value
             distance = np.column_stack([-distance, distance])
         found[:, self.machine.classes_] = distance
         return found
 
     def hits(self, data: "SweepSet") -> NDArray[np.bool_]:
-        """Return (sweep,) whether each decision is right; a sweep without onset counts as wrong."""
+        """Return a mask (sweep,) of right decisions; a sweep without onset counts as wrong."""
         x, usable = window_features(data)
         return np.asarray((self(x) == data.sweeps.labels) & usable)
 
 
 def fit(features: Floats, labels: NDArray[Any], penalty: float, how: str = "") -> FittedSVM:
-    """Fit one machine to (sweep, feature) values and (sweep,) labels, at penalty C."""
+    """Fit a machine to features (sweep, feature) and labels (sweep,), with penalty C."""
     # gamma is scikit-learn's "scale". The kernel is computed here as a matrix product: libsvm
     # computes it pair by pair, dozens of times slower with thousands of features.
     gamma = 1.0 / (features.shape[1] * float(features.var()) or 1.0)
@@ -74,7 +73,7 @@ def fit(features: Floats, labels: NDArray[Any], penalty: float, how: str = "") -
 
 
 def fit_svm(train: "SweepSet", validation: "SweepSet") -> FittedSVM:
-    """Fit one machine per penalty and keep the best on the validation sweeps."""
+    """Fit a machine for each penalty and return the most accurate on the validation sweeps."""
     x, usable = window_features(train)
     if len(set(train.sweeps.labels[usable].tolist())) < 2:
         raise ConfigError("a support vector machine needs touches of two categories to learn from")
@@ -90,8 +89,8 @@ def fit_svm(train: "SweepSet", validation: "SweepSet") -> FittedSVM:
 def window_features(
     data: "SweepSet", disturbance: "Disturbance | None" = None
 ) -> tuple[Floats, NDArray[np.bool_]]:
-    """Return (sweep, step * element * channel) compressed loads, and whether onsets were found."""
-    # Imported here: writing a set's card works without these.
+    """Return compressed loads (sweep, step * element * channel) and a mask of detected onsets."""
+    # Imported here, since writing a set's card does not need these.
     from tactile_rt.models.disturbances import CLEAN
     from tactile_rt.models.evaluation.measures import cut_windows, run_over
 

@@ -1,1 +1,1 @@
-"""Grids of experiments: networks tuned alike, trained and untrained, as in the paper's figure."""
+"""Grids of experiments: many networks, trained and untrained, tuned by the same procedure."""

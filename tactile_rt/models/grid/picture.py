@@ -1,4 +1,4 @@
-"""The picture of a grid's results, as in the paper."""
+"""A bar chart of a grid's results, as in the paper."""
 
 from pathlib import Path
 
@@ -25,7 +25,7 @@ ROW_INCH, BAR = 0.34, 0.4
 
 
 def draw_grid(results: GridResults, path: Path) -> None:
-    """Draw top-1 of every cell and its untrained network, with 95 % intervals, as PNG."""
+    """Draw bars of top-1 of every cell, trained and untrained, into a PNG file."""
     svm = next((row.top1 for row in results.rows if row.name == SVM), None)
     networks = [row for row in results.rows if row.name != SVM]
     groups = {

@@ -1,7 +1,7 @@
-"""The plan of a grid: a TOML file of encoder x attender x objective, each tuned alike.
+"""The plan of a grid: a TOML file of cells (encoder, attender, objective), tuned equally.
 
-Every cell is tuned by as many short trials as any other, then trained with more and more updates
-until more gain nothing, then with further seeds; a cell with a recipe is trained as that says:
+Every cell is tuned by the same number of short trials, then trained with more and more updates
+until further updates gain nothing, then with further seeds. A cell with a recipe is not tuned:
 
 data = "data/wide24"
 search = { learning_rate = [1e-3, 5e-3], warmup = [0.05, 0.3], updates = 500 }
@@ -26,7 +26,7 @@ SHIPPED = resources.files("tactile_rt.models.grid")
 OWN = ("data", "also", "begin", "seed", "learning_rate", "warmup", "epochs", "updates")
 OF_CELL = ("encoder", "attender", "objective", "augmentation", "masking")
 SUPERVISED, RANDOM, SVM = "supervised", "random", "svm"
-NAMING = ("pairs",)  # options that are part of a cell's name
+NAMING = ("pairs",)  # options whose value is part of a cell's name
 # fields of a training's configuration that an untrained network and its probe also depend on
 OF_UNTRAINED = (
     "decoder", "readout", "dropout", "graph", "norm_epsilon", "preprocessing", "first_weights",
@@ -35,19 +35,17 @@ OF_UNTRAINED = (
 
 
 class Candidate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """One network and how it learns; names and values as in `TrainingConfig`.
+    """One cell of a grid: a network and its training, with values as in `TrainingConfig`.
 
     Attributes:
-        objective: The objective, "supervised", or a self-supervised one, whose features a linear
-            probe reads.
-        width: The width of this network; 0 takes the grid's.
-        share: The share of the training objects of every category whose sweeps are learnt from, at
-            least one.
-        begin: The name of a cell whose trained network, of the same seed, this one begins with;
-            empty begins with nothing.
-        seeds: The number of seeds of this cell; 0 takes the grid's.
-        recipe: A recipe of `tactile-rt train`, by which this cell is trained once per seed, without
-            a search; `options` change it.
+        objective: "supervised", or a self-supervised objective, which is scored by a linear probe.
+        width: The width of this network; 0: the grid's width.
+        share: The share of each category's training objects to train on, at least one object.
+        begin: The name of a cell whose trained network of the same seed provides the initial
+            weights; empty: random initial weights.
+        seeds: The number of seeds of this cell; 0: the grid's number.
+        options: Further fields of `TrainingConfig`, which override the grid's or the recipe's.
+        recipe: A recipe of `tactile-rt train`, by which this cell is trained without a search.
     """
 
     encoder: str
@@ -64,13 +62,13 @@ class Candidate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def network(self) -> str:
-        """Encoder, attender and a width of its own: ``zhuang-gru+gpt@0.125``."""
+        """Name of the network, from encoder, attender and the cell's width: ``s4+gpt@0.125``."""
         attender = f"+{self.attender}" if self.attender != "none" else ""
         return self.encoder + attender + (f"@{self.width:g}" if self.width else "")
 
     @property
     def learning(self) -> str:
-        """Objective, augmentations, initial weights and share: ``simclr tactile+masking``."""
+        """Name of the training, from objective, augmentations, initial weights and share."""
         views = [self.augmentation] if self.augmentation != "none" else []
         views += ["masking"] if self.masking else []
         views += [str(self.options[key]) for key in NAMING if key in self.options]
@@ -81,12 +79,12 @@ class Candidate(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     @property
     def name(self) -> str:
-        """Name, unique in a grid: `network` and `learning`, without the word "supervised"."""
+        """Name, unique in a grid: `network` and `learning` without "supervised"."""
         return f"{self.network} {self.learning.removeprefix(SUPERVISED).strip()}".strip()
 
 
 class SweepCounts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Numbers of sweeps to take of each object; 0: all."""
+    """Numbers of sweeps of each object to use, by split; 0: all."""
 
     train: int = 0
     validation: int = 0
@@ -94,11 +92,11 @@ class SweepCounts(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Search(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The trials with a cell's first seed that choose learning rate and warm-up by validation.
+    """Settings of the trials that choose a cell's learning rate and warm-up by validation.
 
     Attributes:
-        learning_rate: The peaks that are tried, all with the first warm-up.
-        warmup: The shares of all updates in which the rate rises; all but the first are tried
+        learning_rate: The peak learning rates to try, all with the first warm-up.
+        warmup: The shares of updates in which the rate rises; all but the first are tried only
             with the best peak.
     """
 
@@ -108,13 +106,13 @@ class Search(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Growth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The lengths of a cell's trainings: doubled until that gains less than `gain`.
+    """Settings of the numbers of updates to try: doubled until the gain is below `gain`.
 
-    Each time it is trained from the beginning, with a whole schedule of its learning rate.
+    Each training starts anew, with a whole schedule of its learning rate.
 
     Attributes:
         first, most: The first and the largest number of updates.
-        gain: The least gain in the score of the validation split, 0 to 1.
+        gain: The smallest gain in validation score, 0 to 1, for which doubling goes on.
     """
 
     first: int = 1000
@@ -123,25 +121,25 @@ class Growth(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 class Pair(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Two cells to compare, by name; "svm" and "random NETWORK" are names too."""
+    """Two cells to compare, by name: a cell's name, "svm" or "random NETWORK"."""
 
     better: str
     than: str
 
 
 class Question(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A question to the grid and the comparisons that answer it."""
+    """A question about the grid's results, and the pairs of cells whose comparison answers it."""
 
     text: str
     pairs: tuple[Pair, ...]
 
 
 class Task(msgspec.Struct, frozen=True):
-    """One task: a cell with a seed, a network's random initialisation, or the SVM.
+    """One task of a grid: a cell and seed, an untrained network, or the SVM.
 
     Attributes:
         name: The name of the cell, "random NETWORK" or "svm".
-        cell: The cell to train; None for the support vector machine.
+        cell: The cell to train or to leave untrained; None for the support vector machine.
     """
 
     name: str
@@ -150,20 +148,20 @@ class Task(msgspec.Struct, frozen=True):
 
     @property
     def slug(self) -> str:
-        """Name of the task's files, from its name and seed."""
+        """Base name of the task's files, from its name and seed."""
         return f"{self.name.replace(' ', '_')}_seed{self.seed}"
 
     @property
     def random(self) -> bool:
-        """True if the network stays as it was initialised."""
+        """True if the network is left untrained, with random weights."""
         return self.name.startswith(RANDOM)
 
 
 class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A whole grid.
+    """The plan of a whole grid, as read from its TOML file.
 
     Attributes:
-        width, seeds: The width and the number of seeds of a cell that has none of its own.
+        width, seeds: The width and the number of seeds of a cell that does not set its own.
     """
 
     data: str
@@ -181,7 +179,7 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     questions: tuple[Question, ...] = msgspec.field(name="question", default=())
 
     def config(self, task: Task, data: Path, **chosen: Any) -> TrainingConfig:
-        """Return a task's training configuration for the sweep set at `data`."""
+        """Return a task's training configuration on `data`; fields in `chosen` take precedence."""
         cell = task.cell
         assert cell is not None
         options: dict[str, Any] = {
@@ -198,7 +196,7 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return TrainingConfig(**options)
 
     def tasks(self) -> list[Task]:
-        """List all tasks, cell by cell, so that an unfinished grid has whole rows."""
+        """List all tasks, cell by cell, so that an unfinished grid has complete rows."""
         tasks = {(SVM, 0): Task(SVM, 0, None)} if self.svm else {}
         for cell in self.cells:
             for seed in range(cell.seeds or self.seeds):
@@ -208,7 +206,7 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return list(tasks.values())
 
     def make_untrained(self, cell: Candidate) -> Candidate:
-        """Return a cell's untrained network, with the settings of its probe, as a candidate."""
+        """Return a candidate with a cell's network and probe settings, but without training."""
         own, usual = self._collect_options(cell), TrainingConfig("")
         names = (k for k in OF_UNTRAINED if k in own or k in self.supervised)
         kept = {k: own.get(k, getattr(usual, k)) for k in names}
@@ -222,13 +220,13 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return {**common, **cell.options}
 
     def find_beginning(self, task: Task) -> Task:
-        """Return the task whose trained network a task begins with."""
+        """Return the task whose trained network provides a task's initial weights."""
         assert task.cell is not None
         (cell,) = (one for one in self.cells if one.name == task.cell.begin)
         return Task(cell.name, task.seed, cell)
 
     def needs(self, task: Task) -> tuple[str, ...]:
-        """Return the slugs of tasks to finish first: the tuning seed, and the initial network."""
+        """Return the slugs of a task's dependencies: the tuning seed and the initial weights."""
         cell = task.cell
         if cell is None or task.random:
             return ()
@@ -238,13 +236,13 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def shipped_grids() -> tuple[str, ...]:
-    """Return the names that `read_grid` takes in place of a path."""
+    """Return the names of the grids in this package, which `read_grid` accepts."""
     files = (entry.name for entry in SHIPPED.iterdir())
     return tuple(sorted(name.removesuffix(".toml") for name in files if name.endswith(".toml")))
 
 
 def read_grid(name: str | Path) -> Grid:
-    """Read a grid file, or a shipped one by name; check every cell."""
+    """Read and check a grid from a TOML file, or from this package by name."""
     if str(name) in shipped_grids():
         nodes = parse_toml((SHIPPED / f"{name}.toml").read_text(), str(name))
     elif Path(name).exists():
@@ -261,7 +259,7 @@ def read_grid(name: str | Path) -> Grid:
 
 
 def _check_grid(grid: Grid) -> None:
-    """Refuse a grid that would otherwise fail after hours of training, or unnoticed."""
+    """Check a grid for errors that would appear only after hours of training, or never."""
     search, growth = grid.search, grid.growth
     if not grid.cells or min(grid.seeds, search.updates, growth.first) < 1:
         raise ConfigError("a grid needs a cell, a seed and an update")

@@ -1,7 +1,7 @@
-"""Running of a grid: its sweeps once, then its tasks over processes.
+"""Execution of a grid: first its sweeps are written, then its tasks run in processes.
 
-All cells share one sweep set, a part of the grid's own. Finished tasks are not repeated, whenever
-the grid was killed.
+All cells share one sweep set, a subset of the grid's `data`. Finished tasks are not repeated after
+an interruption.
 """
 
 import multiprocessing
@@ -30,7 +30,7 @@ from tactile_rt.sets.objects import (
 )
 
 Report = Callable[[Outcome, int, int], None]
-_bench: Workbench | None = None  # of a process of the pool
+_bench: Workbench | None = None  # the workbench of this process, in a process of the pool
 
 
 def run_grid(
@@ -40,10 +40,10 @@ def run_grid(
     report: Report = lambda found, done, total: None,
     accelerator: str = "cpu",
 ) -> None:
-    """Run the tasks of a grid that are not done yet.
+    """Run all unfinished tasks of a grid.
 
     Args:
-        processes: number of processes to share the tasks; 1: this process.
+        processes: number of processes to run tasks in; 1: this process.
         report: called with each outcome, and the numbers of finished and of all tasks.
 
     Raises:
@@ -63,7 +63,7 @@ def _run_locked(grid: Grid, folder: Path, processes: int, report: Report, accele
     finished = {task.slug for task in tasks} - {task.slug for task in waiting}
 
     def ready() -> Task | None:
-        """Remove and return the next waiting task whose needs are done."""
+        """Remove and return the next waiting task whose dependencies are finished."""
         for task in waiting:
             if finished.issuperset(grid.needs(task)):
                 waiting.remove(task)
@@ -102,7 +102,7 @@ def _run_locked(grid: Grid, folder: Path, processes: int, report: Report, accele
 
 
 def prepare(grid: Grid, folder: Path) -> None:
-    """Write, or go on writing, the sweeps of a grid and its test objects."""
+    """Write the sweeps and the test objects of a grid; existing sweeps are kept."""
     write_subset(Path(grid.data), folder / SUBSET, grid.sweeps)
     test = SweepSet.read(folder / SUBSET, "test")
     known = test.sweeps.objects[:0]
@@ -112,7 +112,7 @@ def prepare(grid: Grid, folder: Path) -> None:
 
 
 def write_subset(source: Path, folder: Path, sweeps: SweepCounts) -> None:
-    """Write, or go on writing, the first sweeps of every object of a set."""
+    """Copy the first sweeps of each object into a new set; keep existing files."""
     manifest = SweepManifest.read(source)
     taken = {split: getattr(sweeps, split) for split in SPLITS}
     recipe = {key: value for key, value in manifest.recipe.items() if key != "contacts"}
@@ -138,7 +138,7 @@ def write_subset(source: Path, folder: Path, sweeps: SweepCounts) -> None:
 def _submit(
     pool: ProcessPoolExecutor, grid: Grid, folder: Path, accelerator: str, task: Task
 ) -> Future[Outcome]:
-    """Submit a task to a process that ignores Ctrl-C, even while it begins."""
+    """Submit a task to the pool with Ctrl-C blocked, so that new processes ignore it."""
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         return pool.submit(_do_task, grid, folder, accelerator, task)
@@ -147,7 +147,7 @@ def _submit(
 
 
 def _begin_process() -> None:
-    """Limit torch to one thread and end this process with its parent."""
+    """Initialise a pool process: one torch thread, and exit when the parent exits."""
     import torch
 
     torch.set_num_threads(1)

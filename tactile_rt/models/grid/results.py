@@ -1,4 +1,4 @@
-"""Results of a grid: accuracies with intervals, comparisons, and tables of both."""
+"""Results of a grid: accuracies with intervals, comparisons of cells, and tables."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,16 +22,17 @@ from tactile_rt.models.grid.plan import RANDOM, SVM, Candidate, Grid
 
 @dataclass(frozen=True)
 class Row:
-    """A cell over its seeds, beside its network's random initialisation.
+    """The results of a cell over its seeds, and those of its untrained network.
 
     Attributes:
-        network, learning: Names of the network and of how the cell learns; empty for the SVM.
+        network, learning: Names of the network and of its training; empty for the SVM.
         top1, top5, noisy: Accuracies on the test sweeps, 0 to 1; `noisy` is top-1 at the rated
-            noise. None where there is no figure.
-        known: Top-1 on new sweeps of the objects that it was trained on; None where there are none.
+            noise. None if not measured.
+        known: Top-1 on new sweeps of the training objects; None if the set holds out no sweeps.
         random: The top-1 accuracy of a linear probe on the untrained network, 0 to 1.
-        seconds: The mean CPU time of a seed's training, s, over seeds with a known time; else 0.
-        flat: Whether the last training of `growth` gained less than the grid asks for.
+        seconds: The mean CPU time of a seed's training, s; 0 if not known for any seed.
+        flat: True if the last training of `growth` gained less than the grid's `gain`.
+        tuned: True if the trials could rank the learning rates.
     """
 
     name: str
@@ -50,12 +51,12 @@ class Row:
     flat: bool = False
     failed: str = ""
     known: Interval | None = None
-    tuned: bool = True  # whether its search saw a difference between rates
+    tuned: bool = True
 
 
 @dataclass(frozen=True)
 class Answer:
-    """One comparison: by how much `better` is above `than` on the same test sweeps."""
+    """One comparison: the difference in top-1, `better` minus `than`, on the same test sweeps."""
 
     question: str
     better: str
@@ -64,7 +65,7 @@ class Answer:
 
     @property
     def verdict(self) -> str:
-        """Answer in words: "yes", "no" or "cannot tell"."""
+        """Answer in words: "yes", "no", or "cannot tell" if the interval includes 0."""
         if self.difference.low > 0:
             return "yes"
         return "no" if self.difference.high < 0 else "cannot tell"
@@ -72,7 +73,7 @@ class Answer:
 
 @dataclass(frozen=True)
 class GridResults:
-    """All results that a grid has so far."""
+    """All results of a grid so far: a row per cell, and answers to questions."""
 
     rows: tuple[Row, ...]
     answers: tuple[Answer, ...]
@@ -82,7 +83,7 @@ class GridResults:
 
 
 def gather(grid: Grid, folder: Path) -> GridResults:
-    """Gather the results of all outcomes so far."""
+    """Compute the results of a grid from the outcomes in its folder so far."""
     found: dict[str, list[Outcome]] = {}
     for task in grid.tasks():
         outcome = read_outcome(grid, folder, task)
@@ -145,7 +146,7 @@ def _make_row(
 def _compare_seeds(
     better: list[Outcome] | None, than: list[Outcome] | None, objects: Names
 ) -> Interval | None:
-    """Return the top-1 difference over common seeds; the SVM has one result for all."""
+    """Return the top-1 difference over common seeds; the SVM's one result counts for all."""
     mine = {one.seed: one.right() for one in better or () if one.top1}
     theirs = {one.seed: one.right() for one in than or () if one.top1}
     seeds = sorted(set(mine) & set(theirs))
@@ -157,7 +158,7 @@ def _compare_seeds(
 
 
 def table(results: GridResults) -> str:
-    """Return every cell, then every comparison, as Markdown."""
+    """Format results as Markdown: a table of cells, then a table of comparisons."""
     lines = [
         f"Top-1 on {results.objects} objects that no network trained on ({results.sweeps} sweeps, "
         f"{results.classes} categories, chance {100 / results.classes:.1f} %); in brackets 95 %, "
@@ -215,7 +216,7 @@ def _format_percent(one: Interval | None) -> str:
 
 
 def write_results(results: GridResults, folder: Path) -> None:
-    """Write `results.json` and the tables, `results.md`, into a grid's folder."""
+    """Write results into a grid's folder: `results.json`, and tables as `results.md`."""
     text = msgspec.json.format(msgspec.json.encode(results), indent=1)
     write_whole(folder / "results.json", lambda file: file.write(text))
     write_whole(folder / "results.md", lambda file: file.write(table(results).encode()))

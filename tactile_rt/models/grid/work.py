@@ -1,7 +1,7 @@
 """One task of a grid: tune, train, probe, and score on the test objects.
 
-The validation split alone decides on tuning and training; the test split is used once, when the
-network is chosen.
+Tuning and training use the validation split only; the test split is used once, for the final
+network.
 """
 
 import time
@@ -41,13 +41,13 @@ from tactile_rt.sets.objects import holds_out_sweeps
 from tactile_rt.sets.splits import check_split
 
 BATCH = 128
-LONGER = (1, 2, 4)  # times the updates of a trial, as long as none sees anything
-FURTHER = 2  # rates beyond those that a plan names, at most
+LONGER = (1, 2, 4)  # factors of a trial's updates, tried until trials can rank learning rates
+FURTHER = 2  # most learning rates to try beyond those in the plan
 Report = Callable[..., None]
 
 
 class Workbench:
-    """The splits and test windows, cut as on a robot, that one process's tasks share."""
+    """Runner of a grid's tasks in one process, with shared splits and test windows."""
 
     def __init__(self, grid: Grid, folder: Path, accelerator: str = "cpu") -> None:
         self.grid, self.folder, self.accelerator = grid, folder, accelerator
@@ -64,7 +64,7 @@ class Workbench:
         self._check_tasks()
 
     def _check_tasks(self) -> None:
-        """Check every task against this array, these sweeps and this machine."""
+        """Check that the sweep set and this machine can run every task."""
         manifest = self.test.manifest
         for task in self.grid.tasks():
             if task.cell is None:
@@ -79,7 +79,7 @@ class Workbench:
             pass
 
     def do(self, task: Task, report: Report = lambda _: None) -> Outcome:
-        """Do a task and write its outcome; a network that diverges is an outcome too."""
+        """Run a task, write its outcome and return it; divergence is an outcome too."""
         found = Outcome(task.name, task.seed, outcomes.settings_of(self.grid, task))
         try:
             if task.cell is None:
@@ -117,17 +117,17 @@ class Workbench:
             raise DivergedError("every training of it diverged")
         run = self._run_folder(task, chosen)
         best = run / ("" if task.cell.objective == SUPERVISED else "probe") / "best.pt"
-        if not best.exists():  # only the scores of its trainings were kept
+        if not best.exists():  # only the scores were kept, so train again
             (run / outcomes.POINT).unlink()
             chosen = self._train(task, chosen, report)
         found = msgspec.structs.replace(found, chosen=chosen, seconds=chosen.seconds)
         return self._score_test(found, best, self.grid.config(task, self.data))
 
     def _search(self, task: Task, report: Report) -> tuple[Training, ...]:
-        """Try every learning rate with the first warm-up, then other warm-ups with the best.
+        """Try every learning rate with the first warm-up, then other warm-ups with the best rate.
 
-        If the trials cannot rank the rates, they are repeated twice as long; if the best rate is
-        the lowest or the highest, the next one beyond is tried, too.
+        If the trials cannot rank the rates, they are repeated with twice the updates. If the best
+        rate is the lowest or the highest, the next rate beyond is tried too.
         """
         search = self.grid.search
         chance = 1 / len(self.test.manifest.categories)
@@ -155,7 +155,7 @@ class Workbench:
         return tuple(one for one in trials if one.updates == updates)
 
     def _grow(self, task: Task, best: Training, report: Report) -> tuple[Training, ...]:
-        """Train with twice as many updates each time, until that gains too little."""
+        """Train with more and more updates, doubled each time, until the gain is too small."""
         growth = self.grid.growth
         points: list[Training] = []
         updates, before = growth.first, -inf
@@ -168,7 +168,7 @@ class Workbench:
         return tuple(points)
 
     def _train(self, task: Task, at: Training, report: Report) -> Training:
-        """Train, or read an existing result; the score of a diverged training is 0."""
+        """Train a cell, or read an existing result; a diverged training scores 0."""
         cell, run = task.cell, self._run_folder(task, at)
         assert cell is not None
         begin = ""
@@ -184,7 +184,7 @@ class Workbench:
         key = self._settings_key(task, config)
         if (found := outcomes.read_point(run / outcomes.POINT, key)) is not None:
             return found
-        if cell.begin:  # only the outcome of the beginning may have been kept
+        if cell.begin:  # of the initial network only the outcome may have been kept
             assert begun is not None and begun.chosen is not None
             self._train(self.grid.find_beginning(task), begun.chosen, report)
         timed = self.accelerator == "cpu" and not (run / "last.pt").exists()
@@ -210,7 +210,7 @@ class Workbench:
         return msgspec.structs.replace(done, key="")
 
     def _settings_key(self, task: Task, config: TrainingConfig) -> str:
-        """Return the settings that a training's score depends on, without the grid's folder."""
+        """Return the settings that a training's score depends on, as JSON, without folder names."""
         settings: dict[str, Any] = {"sweeps": msgspec.to_builtins(self.grid.sweeps)}
         settings["config"] = outcomes.training_settings(config)
         settings["config"].pop("data")
@@ -233,7 +233,7 @@ class Workbench:
         return self._score_test(found, best, config)
 
     def splits_of(self, share: float) -> tuple[SweepSet, SweepSet]:
-        """Return training and validation splits, with a share of the training objects."""
+        """Return training and validation splits, with only a share of the training objects."""
         if share == 1:
             return self.splits
         if share not in self._shares:
@@ -258,7 +258,7 @@ class Workbench:
         model, _ = load_checkpoint(best)
         run, labels = run_on(model), self.test.sweeps.labels
         classes = len(self.test.manifest.categories)
-        # Given that the answer is a class.
+        # Conditional on the answer being a class.
         clean, noisy = (among(posteriors(c, run)[:, -1], classes) for c in self._cut_test(config))
         known = np.zeros(0, np.bool_)
         if self.known is not None:

@@ -1,7 +1,7 @@
-"""Batches of training windows, drawn ahead of the network: noise and faults as a robot has them.
+"""Batches of training windows with random noise and sensor faults, as on a robot.
 
-A thread draws and augments them while the network computes. Everything of a batch is drawn from
-(seed, epoch, index) alone, so that neither threads nor an interruption change it.
+A thread draws and augments batches while the network computes. A batch depends on (seed, epoch,
+index) alone, so that neither threads nor an interruption change it.
 """
 
 import queue
@@ -25,15 +25,15 @@ from tactile_rt.models.implausible import IMPLAUSIBLE
 
 CLEAN_SHARE, RATED_SHARE = 1 / 3, 1 / 3  # of training windows; the others draw a uniform noise
 CPU = torch.device("cpu")
-AHEAD = 2  # batches that wait for the network: more would only take memory
-AUGMENTED = 1  # seeds the draws of frames apart from those of loads
+AHEAD = 2  # batches drawn in advance: more would only use memory
+AUGMENTED = 1  # in the seed of the augmentation of frames, so that it differs from that of loads
 JITTER = 5  # samples by which a window may begin earlier or later, by default
 
 
 def partners(objects: NDArray[Any], rng: np.random.Generator) -> NDArray[np.int64]:
-    """Draw for each sweep another one of the same object, uniformly; itself if alone.
+    """Draw for each sweep another sweep of the same object; itself if the only one.
 
-    objects (n,), the object of each -> (n,) indices into it.
+    objects (n,), the object of each sweep -> (n,) indices into `objects`
     """
     order, begins = _order_by_object(objects, rng)
     ends = np.r_[begins[1:], len(objects)] - 1
@@ -45,20 +45,20 @@ def partners(objects: NDArray[Any], rng: np.random.Generator) -> NDArray[np.int6
 
 
 def order_in_twos(objects: NDArray[Any], rng: np.random.Generator) -> NDArray[np.int64]:
-    """Order sweeps at random, but so that two of one object follow each other.
+    """Order sweeps at random, but in pairs of consecutive sweeps of one object.
 
-    objects (n,), the object of each -> (n,) indices into it; the last of an odd number is alone.
+    objects (n,), the object of each sweep -> (n,) indices into `objects`. An odd sweep is unpaired.
     """
     order, begins = _order_by_object(objects, rng)
     place = np.arange(len(objects)) - np.repeat(begins, np.diff(np.r_[begins, len(objects)]))
-    two = np.cumsum(place % 2 == 0) - 1  # number of the pair that each belongs to
+    two = np.cumsum(place % 2 == 0) - 1  # number of each sweep's pair
     return np.asarray(order[np.argsort(rng.random(len(objects))[two], kind="stable")])
 
 
 def _order_by_object(
     objects: NDArray[Any], rng: np.random.Generator
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Order sweeps by object, shuffled within each, and find where each object begins."""
+    """Order sweeps by object, shuffled within each; return the order and each object's start."""
     order = np.lexsort((rng.random(len(objects)), objects))
     in_order = objects[order]
     return order, np.flatnonzero(np.r_[True, in_order[1:] != in_order[:-1]])
@@ -67,15 +67,15 @@ def _order_by_object(
 def check_batches(
     objects: NDArray[np.str_], samples: int, batch: int, jitter: int, two_sweeps: bool
 ) -> None:
-    """Check that the sweeps in which a touch was found can fill a batch.
+    """Check that the sweeps in which a touch was detected are enough for a batch.
 
     Args:
-        objects: (sweep,) the object of each.
-        batch, jitter, two_sweeps: as `TrainingBatches` takes them.
+        objects: (sweep,) the object of each sweep.
+        batch, jitter, two_sweeps: as for `TrainingBatches`.
 
     Raises:
-        ConfigError: a jitter longer than a sweep, not even one batch of sweeps with a touch, or no
-            object that has two.
+        ConfigError: the jitter is longer than a sweep, there are fewer sweeps than a batch needs,
+            or no object has two sweeps though `two_sweeps` is True.
     """
     n = len(objects)
     if jitter >= samples:
@@ -93,24 +93,23 @@ def check_batches(
 
 
 class TrainingBatches:
-    """Epochs of augmented training windows, each drawn afresh from (seed, epoch).
+    """Generator of training windows with random noise and faults, by epoch and batch.
 
-    A third of the windows are clean, a third carry the rated sensor noise, and a third any level;
-    other sensor faults are drawn by the amounts of the set's recipe or the defaults of
-    `SensorFaults`. A recorded sweep keeps its own noise and baseline, as a classifier would meet
-    it, and no noise is added. Labels beyond the categories are those of the set's
-    `refusals`, in their order.
+    A third of the windows have no noise, a third the rated sensor noise, and a third a random
+    level; other sensor faults are drawn by the amounts of the set's recipe or the defaults of
+    `SensorFaults`. A recorded sweep keeps its own noise and baseline, and no noise is added. Labels
+    number the categories, then the set's `refusals`.
 
     Args:
-        jitter: samples by which a window may begin earlier or later.
-        two_sweeps: whether the second view of a window is of another sweep of its object.
-        kinds: the kinds of each category; labels (batch, 3) are then the class, the kind and the
-            object, each -1 where a window has none, and two sweeps of an object follow each other.
-        device: of the samples, offsets and sigmas; a GPU also draws the noise of the samples.
+        jitter: largest number of samples by which a window begins earlier or later.
+        two_sweeps: True if the second view of a window is from another sweep of its object.
+        kinds: the kinds of each category. If given, labels (batch, 3) are class, kind and object,
+            each -1 where a window has none, and batches hold pairs of sweeps of an object.
+        device: device of samples, offsets and sigmas; on a GPU it also draws the samples' noise.
 
     Attributes:
-        easy_epochs: The number of epochs in which noise, offset and drift rise to their amounts: a
-            network that meets them at once takes far longer to learn.
+        easy_epochs: The number of epochs in which noise, offset and drift rise linearly to their
+            amounts: with full amounts at once a network takes far longer to learn.
     """
 
     def __init__(
@@ -128,7 +127,7 @@ class TrainingBatches:
         self.easy_epochs = 0
         self._faults, self._refusals = data.manifest.faults, data.refusals
         starts = data.noisy_starts
-        # Too faint to be found at its noise level: take the onset that is found without noise.
+        # A touch too faint to be detected at a noise level gets its onset without noise.
         self._starts = np.where(starts < 0, starts[0], starts)  # (level, sweep)
         self._usable = np.flatnonzero(self._starts[0] >= 0)
         touched, samples = data.sweeps.objects[self._usable], data.sweeps.values.shape[1]
@@ -143,11 +142,11 @@ class TrainingBatches:
         return len(self._usable) // self._batch
 
     def epoch(self, number: int, view: int = 0) -> Iterator[tuple[Tensor, Tensor, Tensor, Tensor]]:
-        """Yield batches of samples, offset, sigma (as for `InputStage`) and labels (batch,).
+        """Yield an epoch's batches: samples, offset, sigma (see `InputStage`) and labels (batch,).
 
-        Every view of an epoch has the same sweeps in the same order, or others of the same objects
-        if `two_sweeps`. Each has an onset, noise, gains and dead whiskers of its own, which thus
-        cannot reveal that two views are of one sweep.
+        Every view of an epoch has the same sweeps in the same order, or other sweeps of the same
+        objects if `two_sweeps`. Onset, noise, gains and dead whiskers are drawn for each view, so
+        that they cannot reveal that two views are of one sweep.
         """
         rng = np.random.default_rng([self._seed, number])
         if self._related is None:
@@ -175,7 +174,7 @@ class TrainingBatches:
         nearest = np.abs(level[:, None] - found_at).argmin(axis=1)
         start = self._starts[nearest, at] + rng.integers(-self._jitter, self._jitter + 1, n)
         values = data.sweeps.values[at]
-        # Relative to rest, where a magnetometer reads its magnet's field, and a load cell nothing.
+        # Relative to rest, where a magnetometer reads its magnet's field, and a load cell zero.
         rest = np.zeros((n, elements, channels), dtype=np.float32)
         if data.manifest.lead:
             rest = values[:, : data.manifest.lead].mean(axis=1)
@@ -187,7 +186,7 @@ class TrainingBatches:
         if faults.dead_row:
             rows = np.array(data.manifest.spec.grid)[:, 0]
             alive &= (rng.random((n, rows.max() + 1)) >= faults.dead_row)[:, None, None, rows, None]
-        # (batch, step, sub-step, element, channel); large arrays are on the device from here on.
+        # (batch, step, sub-step, element, channel); from here on large arrays are on the device.
         samples = self._to_device(windows(values, start, data.timing))
         samples -= self._to_device(rest)[:, None, None]
         samples *= self._to_device(gain * alive)
@@ -203,7 +202,7 @@ class TrainingBatches:
         samples.addcmul_(
             self._draw_normal(samples.shape, rng), self._to_device(noise)[:, None, None]
         )
-        # The baseline: a mean and a spread over the quiet samples that happened to come before.
+        # The baseline: mean and standard deviation of a random number of quiet samples before it.
         quiet = rng.integers(20, 60, (n, 1, 1))
         per_channel = (n, elements, channels)
         offset = noise * rng.normal(size=per_channel) / np.sqrt(quiet)
@@ -213,7 +212,7 @@ class TrainingBatches:
         return samples, self._to_device(offset), self._to_device(sigma), torch.from_numpy(labels)
 
     def _to_device(self, array: NDArray[Any]) -> Tensor:
-        """Return an array in single precision, on the device."""
+        """Copy an array to the device, in single precision."""
         tensor = torch.from_numpy(np.asarray(array, dtype=np.float32))
         if self._device == "cpu":
             return tensor
@@ -228,7 +227,7 @@ class TrainingBatches:
     def _spoil(
         self, samples: Tensor, labels: NDArray[np.int64], rng: np.random.Generator
     ) -> NDArray[np.int64]:
-        """Make some of the samples implausible, in place; return the new labels (n,) of all."""
+        """Make random windows of a batch implausible, in place; return all labels (n,)."""
         spec, first = self._data.manifest.spec, len(self._data.manifest.categories)
         labels = labels.copy()
         names = [name for name in self._refusals if name in IMPLAUSIBLE]
@@ -243,7 +242,7 @@ class TrainingBatches:
         return labels
 
     def _add_drift(self, samples: Tensor, rng: np.random.Generator, severity: float) -> None:
-        """Add, in place, offset and drift of the readings since their baseline."""
+        """Add random offset and drift since the baseline to samples, in place."""
         data, timing, n = self._data, self._data.timing, len(samples)
         course = np.arange(1, timing.samples + 1) / timing.samples
         faults = self._faults
@@ -257,7 +256,7 @@ class TrainingBatches:
 
 
 def _draw_noise_levels(n: int, largest: float, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Draw (n,) noise in units of the rated: exactly none, exactly the rated, or uniform."""
+    """Draw noise levels (n,), in units of the rated: 0, 1, or uniform to `largest`."""
     which, levels = rng.random(n), largest * rng.random(n)
     levels = np.where(which < CLEAN_SHARE + RATED_SHARE, min(largest, 1.0), levels)
     levels = np.where(which < CLEAN_SHARE, 0.0, levels)
@@ -267,13 +266,13 @@ def _draw_noise_levels(n: int, largest: float, rng: np.random.Generator) -> NDAr
 
 @dataclass(frozen=True)
 class Share:
-    """This device's part of every batch."""
+    """The share of every batch that this device processes."""
 
     rank: int = 0
     devices: int = 1
 
     def of(self, tensor: Tensor) -> Tensor:
-        """(batch, ...) -> every `devices`-th row from `rank` on, as many on every device."""
+        """Return this device's rows of (batch, ...), as many as every other device's."""
         even = len(tensor) // self.devices * self.devices
         return tensor[self.rank : even : self.devices]
 
@@ -283,10 +282,10 @@ class Batch:
     """The input of one update.
 
     Attributes:
-        views: One or two batches of loads, as `InputStage` takes them, each drawn by itself.
-        labels: (batch,) The index of the category of each window, or (batch, 3) as
-            `TrainingBatches` gives them with kinds.
-        generator: The generator that the augmentation of the frames draws from.
+        views: One or two batches of loads, the input of `InputStage`, each drawn independently.
+        labels: (batch,) The index of the category of each window, or (batch, 3) class, kind and
+            object, as from `TrainingBatches` with kinds.
+        generator: The random generator for the augmentation of the frames.
     """
 
     views: list[Loads]
@@ -295,7 +294,7 @@ class Batch:
 
 
 class BatchFeed:
-    """Epochs of batches, each view augmented afresh, on the device."""
+    """Source of a training's batches, with augmented views, drawn in a thread ahead of use."""
 
     def __init__(
         self,
@@ -308,13 +307,13 @@ class BatchFeed:
     ) -> None:
         self._batches, self._augmentation = batches, augmentation
         self._views, self._seed, self._share, self._device = views, seed, share, device
-        self.waited = 0.0  # s that the network has waited for the present epoch's batches
+        self.waited = 0.0  # s spent waiting for batches in the present epoch
 
     def __len__(self) -> int:
         return len(self._batches)
 
     def epoch(self, number: int) -> Yields[Batch, None, None]:
-        """Yield the batches of an epoch."""
+        """Yield this device's batches of an epoch."""
         self.waited = 0.0
         with closing(prefetch_items(lambda: self._draw(number))) as ready:
             while True:
@@ -340,7 +339,7 @@ class BatchFeed:
 
 
 def generator_of(device: torch.device, *seed: int) -> Generator:
-    """Make a generator seeded by any numbers."""
+    """Make a torch random generator seeded by a sequence of integers."""
     word = int(np.random.SeedSequence(seed).generate_state(1, np.uint64)[0] >> np.uint64(1))
     return Generator(device).manual_seed(word)
 
@@ -348,9 +347,9 @@ def generator_of(device: torch.device, *seed: int) -> Generator:
 def prefetch_items(
     draw: Callable[[], Iterator[Batch]], ahead: int = AHEAD
 ) -> Yields[Batch, None, None]:
-    """Yield the items of `draw()`, made in another thread at most `ahead` in advance.
+    """Yield the items of `draw()`, computed by a thread at most `ahead` in advance.
 
-    Exceptions of the thread are raised here; it ends when the iteration is left.
+    Exceptions in the thread are raised here. The thread ends when the iteration is left.
     """
     ready: queue.Queue[Batch | BaseException | None] = queue.Queue(ahead)
     left = threading.Event()

@@ -1,6 +1,6 @@
-"""Configurations of a training, which is all of a run's `config.json`, and of a probe.
+"""Configurations of a training, stored as a run's `config.json`, and of a probe.
 
-Needs no torch, so that invalid values are refused before torch is loaded.
+Needs no torch, so that invalid values are reported before torch is loaded.
 """
 
 from collections.abc import Mapping
@@ -28,9 +28,9 @@ FIRST_WEIGHTS = ("kaiming", "paper")
 RATES_PER = ("update", "epoch")
 WINDOWS = ("onset", "sweep")
 PAIRS = ONE_SWEEP, TWO_SWEEPS = ("one-sweep", "two-sweeps")
-PATHS = ("data", "also", "begin")  # keys of a configuration
+PATHS = ("data", "also", "begin")  # keys of a configuration whose values are paths
 EMBEDDED = 128  # units of the embedding that is trained on identity
-LARGEST = 1e38  # numbers of single precision end there
+LARGEST = 1e38  # about the largest number in single precision
 
 
 @dataclass(frozen=True)
@@ -38,55 +38,56 @@ class TrainingConfig:
     """The configuration of a training; the defaults are the shipped model's recipe.
 
     Attributes:
-        also: The folders of further sweep sets of the same array to train on together; sensor
+        data: The folder of the sweep set to train on.
+        also: The folders of further sweep sets of the same array to train on as well; sensor
             faults are drawn by the first set's recipe.
-        begin: A checkpoint to begin with, of the same array and network; its labels that are not
-            trained now are dropped, and new labels begin untrained. Empty: an untrained network.
+        begin: The checkpoint with the initial weights, of the same array and network; labels only
+            it has are dropped, labels it lacks get random weights. Empty: all weights are random.
         encoder, attender, decoder, width, readout, dropout, graph, norm_epsilon, preprocessing:
             Fields of the network, as in `EADConfig`.
-        first_weights: The weights that a graph's training begins with: "kaiming", or "paper", as
-            `graph_encoder.draw_as_published` draws them.
-        window: The first sample of a window: "onset", where the runtime's detector finds contact,
+        first_weights: The initial weights of a graph: "kaiming", or "paper", drawn by
+            `graph_encoder.draw_as_published`.
+        window: The first sample of a window: "onset", where the runtime's detector reports contact,
             or "sweep", where the object starts to move (the paper).
-        jitter: The number of samples by which a window may begin earlier or later.
-        faults: The sensor faults that are drawn each time that a sweep is taken; None: those of the
+        jitter: The largest number of samples by which a window begins earlier or later.
+        faults: The sensor faults that are drawn each time that a sweep is used; None: those of the
             set's recipe.
         objective: The objective: "supervised", or self-supervised "simclr", "simsiam",
             "autoencoder", "predictive".
-        loss: The loss of the supervised objective: "anytime" (half of it on the last step, half on
-            all steps that an input has reached) or "last" (the paper's: the last step alone).
-        augmentation: The augmentation, a name that `augmentation.build` takes; two views of a
-            window differ by this, by onset and by sensor faults.
+        loss: The loss of the supervised objective: "anytime" (half of the weight on the last step,
+            half on all steps that an input has reached) or "last" (the paper: only the last step).
+        augmentation: The name of the augmentation, see `augmentation`; the two views of a window
+            differ by augmentation, onset and sensor faults.
         pairs: The source of the two views of "simclr" and "simsiam": "one-sweep", the same window
-            twice, or "two-sweeps", windows of two sweeps of the same object, as a robot has them
-            that touches an object twice.
+            twice, or "two-sweeps", windows of two sweeps of the same object, as when a robot
+            touches an object twice.
         temperature: The temperature of "simclr" and of `identity`, by which similarities are
-            divided: 0.1 in the paper; higher where pairs of views are hard to match, as those of
-            two sweeps are.
-        names: The weight of the cross-entropy over the kinds of a sweep's class, of objects that
-            have a kind, beside that over classes (supervised).
-        identity: The weight of a supervised contrast between objects, which trains an embedding;
-            any two sweeps of an object are a pair (supervised).
-        masking: The share of the steps of a window that is blanked, from 0 to less than 1.
-        optimizer, schedule: Names of the optimizer and of the schedule of its rate, as in
+            divided: 0.1 in the paper; higher where pairs of views are hard to match, as for
+            "two-sweeps".
+        names: The weight of the cross-entropy over the kinds within an object's class, in addition
+            to that over classes (supervised); 0: kinds are not learnt.
+        identity: The weight of a supervised contrastive loss between objects, which trains an
+            embedding; any two sweeps of an object are a pair (supervised).
+        masking: The share of a window's steps that is set to zero, from 0 to less than 1.
+        optimizer, schedule: Names of the optimizer and of the learning rate's schedule, see
             `updates`.
         rate_per: The time after which the schedule changes the rate: "update", or "epoch" (the
             paper).
         learning_rate: The peak of the learning rate.
-        own_rates: Whether parameters that ask for a rate and a decay of their own (the state spaces
-            of S4) get them; not so in the paper.
-        warmup: The share of all updates in which the rate rises; 10 of the paper's 100 epochs are
-            0.1.
-        drop_every: The share of all updates between tenfold drops of the schedule "step";
-            StepLR(30) of 100 epochs is 0.3.
+        own_rates: True if parameters that define their own rate and weight decay (the state spaces
+            of S4) get them; False in the paper.
+        warmup: The share of all updates in which the rate rises; 0.1 for 10 of 100 epochs, as in
+            the paper.
+        drop_every: The share of all updates between tenfold drops of the schedule "step"; 0.3 for
+            StepLR(30) and 100 epochs.
         easy: The share of all epochs in which noise, offset and drift rise from 0 to the amounts of
             the set's recipe.
-        updates: The number of updates to stop after, whatever `epochs` says; 0 leaves it to
-            `epochs`.
-        batch: The number of sweeps per update, of all devices together.
+        updates: The number of updates after which training stops, in place of `epochs`; 0:
+            `epochs` decides.
+        batch: The number of sweeps per update, summed over all devices.
         label_smoothing: The share of a label that is spread evenly over all classes.
-        clip_norm: The largest norm of the gradient, to which a larger one is scaled; 0 clips
-            nothing.
+        clip_norm: The largest norm of the gradient; a larger gradient is scaled down to it; 0: no
+            clipping.
         precision: The number format of the products, "bf16" (mixed) or "fp32".
         seed: The seed of the weights, the windows, the noise and the augmentation.
 
@@ -184,15 +185,15 @@ class TrainingConfig:
 
     @property
     def related(self) -> bool:
-        """True if kinds or objects are learnt beside classes."""
+        """True if kinds or objects are learnt in addition to classes."""
         return self.names > 0 or self.identity > 0
 
     def check_sets(self) -> None:
-        """Check that the sets can be trained on, before their sweeps are read.
+        """Check by their manifests that the sets can be trained on, without reading sweeps.
 
         Raises:
-            ConfigError: there is no such network, the sets cannot be joined, or one has no labels
-                to learn from.
+            ConfigError: the network is invalid, the sets cannot be joined, or a set has no labels
+                though the objective needs them.
             RecordingError: a set is missing, is no sweep set, or has an invalid split.
         """
         _, whole = read_manifests(self.folders, self.labelled)
@@ -201,10 +202,10 @@ class TrainingConfig:
     def network(
         self, classes: int, frame: tuple[int, int, int] = MOUSE_FRAME, names: int = 0
     ) -> EADConfig:
-        """Return the network's configuration for numbers of classes and names and a frame size.
+        """Return the configuration of a network with given numbers of classes and names.
 
         Raises:
-            ConfigError: there is no such network.
+            ConfigError: the network is invalid.
         """
         own = {name: getattr(self, name) for name in NETWORK}
         identity = EMBEDDED if self.identity else 0
@@ -212,20 +213,20 @@ class TrainingConfig:
 
 
 def as_json(config: TrainingConfig) -> dict[str, Any]:
-    """Return a configuration as JSON values, which have no tuples."""
+    """Return a configuration as JSON values, with lists in place of tuples."""
     plain: dict[str, Any] = msgspec.json.decode(msgspec.json.encode(asdict(config)))
     return plain
 
 
 def begin_run(config: TrainingConfig, folder: Path) -> None:
-    """Make a run's folder, or check that the existing one is of this run.
+    """Create a run's folder, or check that an existing folder holds this configuration.
 
     Raises:
-        ConfigError: the folder is of another configuration, or of an unknown one.
+        ConfigError: the folder holds a run of another or of an unknown configuration.
     """
     folder.mkdir(parents=True, exist_ok=True)
     path, mine = folder / "config.json", as_json(config)
-    # Before its first epoch is finished, a run has nothing to lose: its options may change.
+    # Before its first epoch is finished, a run has no results, so its options may change.
     if not (folder / "last.pt").exists():
         text = msgspec.json.format(msgspec.json.encode(mine), indent=1)
         write_whole(path, lambda file: file.write(text))
@@ -248,7 +249,7 @@ def begin_run(config: TrainingConfig, folder: Path) -> None:
 
 
 def _equal(key: str, one: Any, other: Any) -> bool:
-    """Return whether two values of a key are equal; paths may be spelt differently."""
+    """Return whether two values of a key are equal; paths are compared after resolving."""
     if key in PATHS and one and other:
         names = [[value] if isinstance(value, str) else value for value in (one, other)]
         one, other = ([str(Path(name).resolve()) for name in some] for some in names)
@@ -260,12 +261,12 @@ class ProbeConfig:
     """The configuration of a probe: the paper's, except for `standardise`.
 
     Attributes:
-        data: The folder of the sweep set; empty takes the one that the network was trained on.
-        drop_epochs: The number of epochs between tenfold drops of the rate (StepLR).
-        standardise: Whether to fit on features of zero mean and unit variance, folded into the
-            layer afterwards; the paper does not, and features that are small then hardly train.
-        readout: The steps to fit on: "last" takes the last step (the paper), "mean" the mean of all
-            steps that an input has reached, the only fair choice for a network without memory.
+        data: The folder of the sweep set; empty: the set that the network was trained on.
+        drop_epochs: The number of epochs between tenfold drops of the learning rate (StepLR).
+        standardise: True to scale features to zero mean and unit variance for the fit, which is
+            then folded into the layer. Without it (the paper), small features hardly train.
+        readout: The features to fit on: "last", those of the last step (the paper), or "mean", the
+            mean of all steps that an input has reached, which suits a network without memory.
         seed: The seed of the layer, the windows and their order.
     """
 
@@ -290,7 +291,7 @@ class ProbeConfig:
 
 
 def _check_positive(name: str, value: float) -> None:
-    if not value > 0:  # which NaN is not either
+    if not value > 0:  # also if it is NaN
         raise ConfigError(f"{name} must be positive, not {value}")
     if not value < LARGEST:
         raise ConfigError(f"{name} must be below {LARGEST:g}, not {value}")
@@ -302,15 +303,15 @@ def _check_seed(seed: int) -> None:
 
 
 class DivergedError(ModelError):
-    """A diverged training, whose gradients are not finite: a lower rate may help."""
+    """Error of a training with infinite or NaN gradients; a lower learning rate may help."""
 
 
 @dataclass
 class Progress:
-    """The report of a run after every update and every epoch.
+    """The progress of a run, reported after every update and every epoch.
 
-    `metrics`, after an epoch: the values of its line of `history.csv`, and `waiting`, the share of
-    the epoch that was spent waiting for data.
+    After an epoch, `metrics` holds the values of the epoch's line in `history.csv`, and "waiting",
+    the share of the epoch's time that was spent waiting for data.
     """
 
     epoch: int

@@ -1,7 +1,7 @@
 """Training of an EAD network on a sweep set.
 
-A run that was killed resumes after its last finished epoch and ends with the same numbers as an
-uninterrupted one. Under torchrun every process has a share of each batch:
+An interrupted run resumes after its last finished epoch and ends with the same results as an
+uninterrupted run. Under torchrun every process has a share of each batch:
 
     torchrun --nproc-per-node 2 --no-python tactile-rt train data/default24 runs/mine
 """
@@ -53,7 +53,7 @@ if TYPE_CHECKING:
 
 Report = Callable[[Progress], None]
 Splits = tuple[SweepSet, SweepSet]  # to train and to validate on
-VIEWS, FRAMES = 2**32, 2**32 + 1  # epochs that no training reaches: other draws
+VIEWS, FRAMES = 2**32, 2**32 + 1  # in seeds of validation: epochs that no training reaches
 Score = tuple[dict[str, float], float]
 
 
@@ -65,7 +65,7 @@ def train(
     device: str = "auto",
     splits: Splits | None = None,
 ) -> Path:
-    """Train, or resume a run that was interrupted; return the path of the best checkpoint.
+    """Train a network, or resume an interrupted run; return the path of the best checkpoint.
 
     Args:
         device: "auto" (an accelerator if there is one), "cpu", "cuda", ...
@@ -76,10 +76,10 @@ def train(
             or the configuration cannot be trained.
         RecordingError: the sweep set is missing, unfinished, damaged or unfit.
         DivergedError: the training diverged.
-        ModelError: `last.pt` or `history.csv` is damaged, or the best network is gone.
-        OSError: the medium is full, or failed; the last checkpoint is as it was.
+        ModelError: `last.pt` or `history.csv` is damaged, or `best.pt` is missing.
+        OSError: the disk is full, or failed; the last checkpoint is unchanged.
     """
-    first = os.environ.get("RANK", "0") == "0"  # of torchrun's processes, the one that writes
+    first = os.environ.get("RANK", "0") == "0"  # only torchrun's first process writes
     with alone_in(folder) if first else nullcontext(), launch_devices(config, device) as fabric:
         return _train(fabric, config, folder, report, splits)
 
@@ -118,7 +118,7 @@ def _train(
 
     while run.done < run.updates:
         epoch, began, losses = run.epoch, time.monotonic(), []
-        # Dropout: a resumed epoch is the same epoch, and no two devices drop the same.
+        # For dropout: the same in a resumed epoch, and different on every device.
         torch.manual_seed(config.seed * 1000 + epoch + 2**40 * share.rank)
         objective.train()
         with closing(feed.epoch(epoch)) as drawn:
@@ -130,7 +130,7 @@ def _train(
                 norm = fabric.clip_gradients(
                     wrapped, run.optimizer, max_norm=most, error_if_nonfinite=False
                 )
-                # Clipping would turn it into zeros or NaN.
+                # Clipping would turn such a gradient into zeros or NaN.
                 if norm is None or not torch.isfinite(norm):
                     raise DivergedError(
                         f"{folder}: training diverged in epoch {epoch + 1} (gradient norm {norm}); "
@@ -143,7 +143,7 @@ def _train(
                 report(Progress(epoch, run.epochs, run.done, run.updates, losses[-1]))
         run.epoch += 1
         if share.devices > 1:
-            for buffer in objective.buffers():  # batch norm's means are each device's own
+            for buffer in objective.buffers():  # batch norm's means differ between devices
                 torch.distributed.broadcast(buffer, 0)
         found, score = fabric.broadcast(validate(objective))
         if not isfinite(score):  # no later score would be higher
@@ -172,7 +172,7 @@ def _train(
 
 
 def initialise(config: TrainingConfig, folder: Path, splits: Splits | None = None) -> Path:
-    """Write a run's network before its first update as a `best.pt`; return the path."""
+    """Write a configuration's untrained network as a `best.pt`; return the path."""
     torch.manual_seed(config.seed)
     training, _ = _take_splits(config, splits)
     model = build_objective(config, training).model
@@ -184,14 +184,14 @@ def initialise(config: TrainingConfig, folder: Path, splits: Splits | None = Non
 
 
 def _take_splits(config: TrainingConfig, splits: Splits | None) -> Splits:
-    """Return training and validation splits with a configuration's window and faults."""
+    """Return the training and validation splits, with the configuration's window and faults."""
     training, validating = splits or read_splits(config.folders, config.labelled)
     drawn = asdict(config)
     return drawn_as(training, drawn), drawn_as(validating, drawn)
 
 
 def _mean_loss(fabric: "Fabric", losses: list[float]) -> float:
-    """Return the mean loss over an epoch's updates and all devices, which share every batch."""
+    """Return the mean loss over an epoch's updates and over all devices."""
     mean = float(np.mean(losses))
     if fabric.world_size == 1:
         return mean
@@ -202,15 +202,15 @@ def _mean_loss(fabric: "Fabric", losses: list[float]) -> float:
 
 @contextmanager
 def launch_devices(config: TrainingConfig, device: str) -> Iterator["Fabric"]:
-    """Launch the devices of a run, which stay together until the block ends.
+    """Launch a run's devices with Lightning Fabric; the process group ends with the block.
 
     Args:
         device: "auto", "cpu", "cuda", ...
 
     Raises:
-        ConfigError: a batch is too small to be shared, or there is no such device here.
+        ConfigError: a batch is too small to be shared, or this machine has no such device.
     """
-    # Imported here: it takes seconds, which loading a checkpoint need not spend.
+    # Imported here: the import takes seconds, and loading a checkpoint does not need it.
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         from lightning.fabric import Fabric
@@ -222,15 +222,15 @@ def launch_devices(config: TrainingConfig, device: str) -> Iterator["Fabric"]:
         raise ConfigError(f"a batch of {config.batch} is too small to be shared by {size} devices")
     for name in ("lightning.fabric", "lightning.pytorch"):  # a run reports enough itself
         logging.getLogger(name).setLevel(logging.WARNING)
-    # From 1 x 1 kernels, whose numbers lie alike under both strides.
+    # Caused by 1 x 1 kernels, whose memory layout is the same with both strides.
     warnings.filterwarnings("ignore", message="Grad strides do not match bucket view strides")
     try:
         fabric = Fabric(
             accelerator=device,
             devices=local,
             num_nodes=size // local,
-            # Static: some layers of some networks (a position never reached) are not used in a
-            # window, and always the same ones.
+            # Static: some networks have layers that no window uses (a position never reached), and
+            # these are always the same.
             strategy=DDPStrategy(static_graph=True) if size > 1 else "auto",
         )
     # no such kind; none in this machine; a package that it needs is missing
@@ -246,11 +246,11 @@ def launch_devices(config: TrainingConfig, device: str) -> Iterator["Fabric"]:
 
 
 class Validation:
-    """Measurement of an objective on the validation split.
+    """Validation of an objective: a call measures it on the validation split.
 
-    Supervised: top-1 without and with rated noise; the score is their mean, since a robot's
-    sensor is somewhere between, or the former alone where training draws no noise. Self-supervised:
-    the loss, with the same augmentation every time; the score is its negative.
+    Supervised: top-1 without and with rated noise. The score is their mean, since a robot's
+    sensor is between the two, or only the former where training draws no noise. Self-supervised:
+    the loss, with the same augmentation every time; the score is the negative loss.
 
     Args:
         share: this device's share of every batch.
@@ -271,7 +271,7 @@ class Validation:
             self._measure_top1 if supervised else self._measure_loss
         )
         if supervised:
-            # Cut once, since they are the same after every epoch.
+            # Cut once, since the windows are the same after every epoch.
             self._clean, self._noisy = (
                 list(cut_windows(data, disturbance=one)) for one in (CLEAN, RATED)
             )
@@ -298,15 +298,15 @@ class Validation:
             answers = posteriors(cut, run)[:, -1]
             touched = np.concatenate([one.detected for one in cut])
             if not np.isfinite(answers[touched]).all():
-                return {}, nan  # overflow; gradients show it only in training's windows
-            # Refusals are left out: they are measured elsewhere.
+                return {}, nan  # overflow; gradients reveal it only in training windows
+            # Refusals are left out: the evaluation of a model file measures them.
             shares.append(hits(among(answers, classes), labels).mean())
         clean, noisy = shares
         metrics = {"validation_top1": float(clean), "validation_top1_noisy": float(noisy)}
         return metrics, float(clean + noisy) / 2 if data.manifest.faults.noise else float(clean)
 
     def _cut_share(self, at: NDArray[np.int64]) -> Loads:
-        """Cut this device's share of some sweeps' windows, as `InputStage` takes them."""
+        """Cut this device's share of the windows of sweeps `at`, the input of `InputStage`."""
         cut = windows(self._data.sweeps.values[at], self._found.start[at], self._data.timing)
         arrays = cut, self._found.offset[at], self._found.sigma[at]
         samples, offset, sigma = (self._share.of(torch.from_numpy(a)) for a in arrays)
@@ -315,7 +315,7 @@ class Validation:
     @torch.inference_mode()
     def _measure_loss(self, objective: Objective) -> Score:
         data, config = self._data, self._config
-        # Whole batches if possible: a contrast is harder in a larger batch.
+        # Batches of the training's size if possible: a contrast is harder in a larger batch.
         parts = max(len(self._usable) // config.batch, 1)
         total = torch.zeros((), device=self._device)
         for index, at in enumerate(np.array_split(self._usable, parts)):

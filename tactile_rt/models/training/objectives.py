@@ -1,20 +1,20 @@
-"""Objectives of a training: categories, contrasts of two views, or rebuilding the window.
+"""Objectives of a training: classification, contrast of two views, reconstruction, prediction.
 
-An objective is a module that holds the network and its own heads, which are discarded after the
-training.
+An objective is a module that holds the network and the objective's own heads, which are discarded
+after the training.
 
     objective(views, labels, generator) -> loss
 
-`views` are `Objective.views` batches of loads (samples, offset, sigma), one or two, as
-`TactileClassifier` takes them; labels (batch,) matter to the supervised objective alone, which also
-takes those of kind and object (batch, 3). Two methods share the work: `see` makes the frames, whose
-augmentation it draws from the generator, and `loss` draws nothing but dropout.
+`views` are `Objective.views` batches of loads (samples, offset, sigma), one or two, the input of
+`TactileClassifier`. Only the supervised objective uses labels: classes (batch,), or classes, kinds
+and objects (batch, 3). Two methods share the work: `see` computes the augmented frames, with draws
+from the generator, and `loss` computes the loss, with no random draws but dropout.
 
-- `Supervised`: cross-entropy with the category, with the kind inside of it, and a supervised
+- `Supervised`: cross-entropy of the category and of the kind within it, and a supervised
   contrast between objects (Khosla et al. 2020).
-- `SimCLR` (Chen et al. 2020): each view of a window is to be matched to the other among all.
+- `SimCLR` (Chen et al. 2020): each view of a window must be matched with the other view.
 - `SimSiam` (Chen and He 2021): one view predicts the other, whose gradient is stopped.
-- `Autoencoder` (Olshausen and Field 1996): sparse features of each step rebuild its frame.
+- `Autoencoder` (Olshausen and Field 1996): sparse features of each step reconstruct its frame.
 - `Predictive` (autoregressive predictive coding, Chung et al. 2019): the features of each step
   predict the frames of later steps.
 
@@ -39,9 +39,9 @@ from tactile_rt.models.training.config import TrainingConfig
 
 # Sizes of the heads, at width 1.
 CONTRASTED = (2048, 128)  # SimCLR's neck: hidden and output
-LEAST = 32  # the neck's output at any width: fewer directions cannot separate a batch
+LEAST = 32  # smallest output of the neck: fewer dimensions cannot separate a batch
 PROJECTED, BOTTLENECK = 2048, 512  # SimSiam's projector and predictor
-NECK_SPREAD = 0.01  # standard deviation of the neck's first weights
+NECK_SPREAD = 0.01  # standard deviation of the neck's initial weights
 DECONVOLUTIONS = 3
 PREDICTED = 4  # steps ahead that `Predictive` predicts
 OUTSIDE = -1e4  # the logit of a kind of another class
@@ -49,10 +49,10 @@ SPARSITY = 1e-4  # of the autoencoder: weight of the mean of |features|
 
 
 def build_objective(config: TrainingConfig, training: SweepSet) -> "Objective":
-    """Build the network of a configuration with its objective.
+    """Build the objective of a configuration, with its network.
 
     Raises:
-        ConfigError: there is no such network, or the array cannot be augmented so.
+        ConfigError: the network is invalid, or the augmentation does not suit the array.
     """
     manifest = training.manifest
     kinds = manifest.kinds if config.names else {}
@@ -82,10 +82,10 @@ def build_objective(config: TrainingConfig, training: SweepSet) -> "Objective":
 
 
 class Objective(nn.Module):
-    """A network and the loss that it is trained by.
+    """Base class of objectives: a network, the augmentation of its input, and its loss.
 
     Attributes:
-        views: The number of times that an update sees each window, each time augmented afresh.
+        views: The number of differently augmented views of each window in an update.
     """
 
     views = 1
@@ -96,14 +96,14 @@ class Objective(nn.Module):
         self.augmentation = augmentation
 
     def frames(self, loads: Loads, generator: Generator) -> Tensor:
-        """Return augmented frames of a batch, (batch, step, sub-step * channel, row, column)."""
+        """Compute augmented frames (batch, step, sub-step * channel, row, column) from loads."""
         return self.augmentation.frames(self.model.inputs(*loads), generator)
 
     def embedding(self, frames: Tensor) -> Tensor:
-        """Return features (batch, feature) of windows (batch, step, ...), after the attender.
+        """Map frames (batch, step, ...) to one feature vector per window (batch, feature).
 
-        Those of the last step or, if the network's readout is "mean", the mean over all steps
-        that an input has reached.
+        The features are the attender's output in the last step or, if the network's readout is
+        "mean", its mean over all steps that an input has reached.
         """
         features = self.model.features(frames)
         network = self.model.network
@@ -112,7 +112,7 @@ class Objective(nn.Module):
         return features[:, -1]
 
     def see(self, views: Sequence[Loads], generator: Generator) -> list[Tensor]:
-        """Return the input of `loss`: the augmented frames of every view.
+        """Compute the input of `loss`: the augmented frames of every view.
 
         Args:
             views: `self.views` batches of loads, SI.
@@ -121,19 +121,19 @@ class Objective(nn.Module):
         return [mask(self.frames(view, generator), generator) for view in views]
 
     def loss(self, seen: Sequence[Tensor], labels: Tensor) -> Tensor:
-        """Return the loss of a batch from the result of `see` and labels (batch,)."""
+        """Compute the loss of a batch, given the result of `see` and labels (batch,)."""
         raise NotImplementedError
 
     def forward(self, views: Sequence[Loads], labels: Tensor, generator: Generator) -> Tensor:
-        """Return the loss of a batch; arguments as for `see` and `loss`."""
+        """Compute the loss of a batch, with arguments as for `see` and `loss`."""
         return self.loss(self.see(views, generator), labels)
 
 
 def anytime_loss(logits: Tensor, labels: Tensor, smoothing: float, lag: int) -> Tensor:
-    """Average the last step's cross-entropy and the mean of all steps after the lag.
+    """Average the last step's cross-entropy and the mean cross-entropy from step `lag` on.
 
-    logits (batch, step, class), labels (batch,) -> scalar. The first `lag` steps, before any input
-    has reached the output, would only teach the prior. A label of -1 counts as no loss.
+    logits (batch, step, class), labels (batch,) -> scalar. The first `lag` steps, which no input
+    has reached, would only teach the prior. A window with label -1 has no loss.
     """
     steps = logits[:, lag:]
     n = steps.shape[1]
@@ -148,7 +148,7 @@ def anytime_loss(logits: Tensor, labels: Tensor, smoothing: float, lag: int) -> 
 
 
 def last_loss(logits: Tensor, labels: Tensor, smoothing: float) -> Tensor:
-    """Return the cross-entropy of the last step, as published; shapes as above."""
+    """Return the last step's cross-entropy (the paper); shapes as in `anytime_loss`."""
     each = F.cross_entropy(
         logits[:, -1].float(), labels, reduction="none", ignore_index=-1, label_smoothing=smoothing
     )
@@ -156,10 +156,10 @@ def last_loss(logits: Tensor, labels: Tensor, smoothing: float) -> Tensor:
 
 
 def identity_loss(embedding: Tensor, objects: Tensor, temperature: float) -> Tensor:
-    """Contrast embeddings of one object with those of all others (Khosla et al. 2020).
+    """Return the supervised contrastive loss of embeddings by object (Khosla et al. 2020).
 
-    embedding (n, unit) of length 1, objects (n,), -1: of none -> scalar, the mean over all that
-    have another of their object. Cosines are divided by the temperature.
+    embedding (n, unit) of unit norm, objects (n,) numbers, -1 for no object -> scalar, the mean
+    over rows whose object has another row. Cosines are divided by the temperature.
     """
     itself = torch.eye(len(objects), dtype=torch.bool, device=objects.device)
     same = (objects[:, None] == objects) & (objects >= 0) & ~itself
@@ -170,13 +170,13 @@ def identity_loss(embedding: Tensor, objects: Tensor, temperature: float) -> Ten
 
 
 class Supervised(Objective):
-    """Classification of categories and, with labels (batch, 3), of kinds and objects.
+    """Supervised objective: classes and, with labels (batch, 3), kinds and objects.
 
     Args:
         loss: "anytime" or "last".
-        class_of: (name,) the class of each kind; a kind competes only with those of its class.
+        class_of: (name,) the class of each kind; a kind competes only with kinds of its class.
         names, identity: weights of the losses of kinds and of objects.
-        temperature: of the loss of objects.
+        temperature: temperature of the loss of objects.
     """
 
     class_of: Tensor
@@ -226,7 +226,7 @@ class Supervised(Objective):
 
 
 def nt_xent(first: Tensor, second: Tensor, temperature: float) -> Tensor:
-    """Return the normalised temperature-scaled cross-entropy of matching 2 n views in pairs.
+    """Return the NT-Xent loss of SimCLR: the cross-entropy of matching two views of windows.
 
     first, second (n, feature): the two views of each of n windows -> scalar. Cosines are divided by
     the temperature.
@@ -239,9 +239,9 @@ def nt_xent(first: Tensor, second: Tensor, temperature: float) -> Tensor:
 
 
 class SimCLR(Objective):
-    """Contrast of two views; the neck (Linear, BN, ReLU, Linear, BN) is discarded afterwards.
+    """SimCLR objective: contrast of two views by a neck (Linear, BN, ReLU, Linear, BN).
 
-    Both views are one batch, also for batch norms in the network.
+    The neck is discarded afterwards. Both views form one batch, also for batch norms.
     """
 
     views = 2
@@ -265,7 +265,7 @@ class SimCLR(Objective):
 
 
 def _gather_rows(rows: Tensor) -> Tensor:
-    """Gather the rows of all devices' shares of the batch, for more negatives."""
+    """Concatenate the rows of all devices' shares of a batch, for more negative pairs."""
     if not (torch.distributed.is_available() and torch.distributed.is_initialized()):
         return rows
     gathered: Tensor = _GatheredRows.apply(rows)  # type: ignore[no-untyped-call]
@@ -273,7 +273,7 @@ def _gather_rows(rows: Tensor) -> Tensor:
 
 
 class _GatheredRows(torch.autograd.Function):
-    """The rows of all devices; the gradient of each sums the losses of all."""
+    """Concatenation of all devices' rows, with gradients summed over the devices' losses."""
 
     @staticmethod
     def forward(ctx: Any, rows: Tensor) -> Tensor:
@@ -289,7 +289,7 @@ class _GatheredRows(torch.autograd.Function):
 
 
 class SimSiam(Objective):
-    """A projector of three layers, a predictor with a bottleneck, and a stopped gradient."""
+    """SimSiam objective: a projector, a predictor with a bottleneck, and a stopped gradient."""
 
     views = 2
 
@@ -308,12 +308,12 @@ class SimSiam(Objective):
 
 
 def _distance(prediction: Tensor, target: Tensor) -> Tensor:
-    """Return the negative cosine similarity to a fixed target; (batch, feature) -> scalar."""
+    """Return the mean negative cosine similarity (batch, feature) to a target without gradient."""
     return -F.cosine_similarity(prediction.float(), target.detach().float(), dim=1).mean()
 
 
 class Autoencoder(Objective):
-    """Reconstruction of each step's frame by a linear layer and three 3 x 3 deconvolutions.
+    """Autoencoder objective: a linear layer and three 3 x 3 deconvolutions rebuild each frame.
 
     loss = 0.5 mean squared error of the (normalised) frames + 1e-4 mean |features|
     """
@@ -340,11 +340,11 @@ class Autoencoder(Objective):
 
 
 class Predictive(Objective):
-    """Prediction of the next four steps' frames from each step's features by a linear layer.
+    """Predictive objective: a linear layer predicts the next four frames from each step's features.
 
-    A network never sees later steps, so they are hidden from every step at once; masked steps are
-    predicted all the same. The loss is the mean squared error of the normalised frames, over all
-    predictions of later steps in the window by steps that an input has reached.
+    A causal network reads no later steps, so the targets are hidden; masked steps are predicted
+    too. The loss is the mean squared error of the normalised frames, over all predictions within
+    the window from steps that an input has reached.
     """
 
     def __init__(self, model: TactileClassifier, augmentation: Augmentation) -> None:
@@ -353,7 +353,7 @@ class Predictive(Objective):
         self.head = nn.Linear(model.network.feature_size, PREDICTED * channels * rows * columns)
 
     def see(self, views: Sequence[Loads], generator: Generator) -> list[Tensor]:
-        """Return the frames to predict, and those that the network sees."""
+        """Compute the frames to predict, and the masked frames that the network reads."""
         (frames,) = (self.frames(view, generator) for view in views)
         return [frames, self.augmentation.mask(frames, generator)]
 
@@ -370,12 +370,12 @@ class Predictive(Objective):
 
 
 def _in_single_precision(like: Tensor) -> torch.autocast:
-    """Return a single-precision context: mixed precision ends at the network's output."""
+    """Return a context without autocast, to compute losses in single precision."""
     return torch.autocast(like.device.type, enabled=False)
 
 
 def _stack(*sizes: int, bias: bool = True) -> nn.Sequential:
-    """Build linear layers of these sizes, each with a batch norm, and ReLUs between."""
+    """Build linear layers of these sizes, each with batch norm, and ReLUs between them."""
     layers: list[nn.Module] = []
     for of, to in pairwise(sizes):
         layers += [nn.Linear(of, to, bias), nn.BatchNorm1d(to), nn.ReLU()]
@@ -383,5 +383,5 @@ def _stack(*sizes: int, bias: bool = True) -> nn.Sequential:
 
 
 def _scale(size: int, width: float, least: int = 1) -> int:
-    """Return a layer's size at the network's width."""
+    """Return a layer's size scaled by the network's width, at least `least`."""
     return max(round(size * width), least)

@@ -1,7 +1,7 @@
-"""Linear probe: how much of the category a frozen network's features hold.
+"""Linear probe: a classifier of categories on a frozen network's features.
 
-The network stays in evaluation mode, so its features are computed once and the probe takes
-seconds. (The published probe left dropout and batch norm in training mode.)
+The network stays in evaluation mode, so features are computed once and a probe takes seconds.
+(The published probe left dropout and batch norm in training mode.)
 """
 
 from collections.abc import Callable
@@ -23,7 +23,7 @@ from tactile_rt.models.training.config import ProbeConfig, Progress
 from tactile_rt.models.training.updates import log_epoch
 from tactile_rt.sets.splits import check_split, trained_objects
 
-WINDOWS = 32  # at a time, through the frozen network
+WINDOWS = 32  # windows in a batch through the frozen network
 
 
 def probe(
@@ -33,15 +33,15 @@ def probe(
     report: Callable[[Progress], None] = lambda _: None,
     splits: tuple[SweepSet, SweepSet] | None = None,
 ) -> Path:
-    """Fit a linear layer on a frozen network's features; return a classifier's `best.pt`.
+    """Fit a linear classifier on a checkpoint's frozen features; return its `best.pt`.
 
-    The layer of the best epoch by the validation split is kept.
+    The layer of the epoch with the best validation top-1 is stored.
 
     Args:
         splits: the result of `read_splits`, if several runs share it.
 
     Raises:
-        ModelError: no checkpoint.
+        ModelError: there is no such checkpoint.
         SpecMismatch: the set is of another array.
         RecordingError, ConfigError: the set cannot be used, as in `train`; the folder is that of a
             training run, or another process writes into it.
@@ -54,11 +54,11 @@ def probe(
             check_split(path, manifest)
             splits = SweepSet.read(path, "train"), SweepSet.read(path, "validation")
             check_sets(path, splits)
-        # the layer is over categories alone, without refusals
+        # the layer classifies categories only, not refusals
         data, validation = (select_labelled(drawn_as(one, saved["config"])) for one in splits)
         torch.manual_seed(config.seed)
         jitter = saved["config"].get("jitter", JITTER)
-        touched = int((data.noisy_starts[0] >= 0).sum())  # in a small set some sweeps may be silent
+        touched = int((data.noisy_starts[0] >= 0).sum())  # sweeps may be silent in a small set
         batches = TrainingBatches(data, max(min(WINDOWS, touched), 1), config.seed, jitter)
         begin = trained.network.encoder.lag if config.readout == "mean" else -1
         drawn = [(_extract(trained, begin, *loads), labels) for *loads, labels in batches.epoch(0)]
@@ -103,14 +103,14 @@ def linear_probe(
     classes: int,
     config: ProbeConfig,
 ) -> tuple[nn.Linear, list[dict[str, float]]]:
-    """Fit a linear layer, and choose its best epoch by validation.
+    """Fit a linear layer to features and labels, and choose the best epoch by validation.
 
     Args:
-        features, labels: (window, feature), (window,) to fit on.
-        validation, answers: the same, to choose the epoch by.
+        features, labels: (window, feature), (window,) to fit to.
+        validation, answers: features and labels of the same shapes, to choose the epoch by.
 
     Returns:
-        The layer of the best epoch, for features as they come, and the history by epoch.
+        The layer of the best epoch, for features that are not standardised, and the history.
     """
     torch.manual_seed(config.seed)
     mean, scale = torch.zeros(features.shape[1]), torch.ones(features.shape[1])
@@ -143,14 +143,14 @@ def linear_probe(
 def _extract(
     model: TactileClassifier, begin: int, samples: Tensor, offset: Tensor, sigma: Tensor
 ) -> Tensor:
-    """Return (window, feature), the mean over the steps from `begin` on."""
+    """Return a network's features (window, feature), averaged over the steps from `begin` on."""
     with torch.inference_mode():
         steps = model.features(model.inputs(samples, offset, sigma))[:, begin:]
         return steps.float().mean(dim=1)
 
 
 def _extract_clean(model: TactileClassifier, begin: int, data: SweepSet) -> tuple[Tensor, Tensor]:
-    """Return features and labels of the clean sweeps in which contact is found."""
+    """Return features and labels of the sweeps, without added noise, that show contact."""
     found = data.onsets(data.sweeps.values)
     usable = torch.from_numpy(found.start >= 0).nonzero().flatten()
     if not len(usable):

@@ -1,12 +1,12 @@
-"""Recipes: training configurations in TOML, the paper's and one's own.
+"""Recipes: training configurations in TOML, from this package or the user.
 
 about = "SimCLR of a recurrent encoder (Chung et al. 2025, Tables A4 and A5)"
 
-[train]                     # the fields of `TrainingConfig`; what is left out has its default
+[train]                     # fields of `TrainingConfig`; missing fields have their defaults
 encoder = "zhuang-intersection-ln"
 objective = "simclr"
 
-[search]                    # what else the paper tried; a note, unless somebody runs it
+[search]                    # other values that the paper tried; a note, not used by a training
 learning_rate = [0.1, 0.01, 0.001, 0.0001]
 """
 
@@ -28,11 +28,11 @@ KEYS = tuple(f.name for f in fields_of(TrainingConfig) if f.name != "data")
 
 
 class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """A recipe file.
+    """The content of a recipe file: values of a training's options, and values to search.
 
     Attributes:
-        train: Fields of `TrainingConfig`, by their names.
-        search: Lists of all values that are to be tried, by the names of their fields.
+        train: Values of fields of `TrainingConfig`, by name.
+        search: Lists of values to try, by the field's name.
     """
 
     about: str = ""
@@ -40,11 +40,11 @@ class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     search: dict[str, list[Any]] = {}
 
     def config(self, data: str, sets: Sequence[str] = (), **overrides: Any) -> TrainingConfig:
-        """Return the configuration, with some values replaced.
+        """Return the recipe's configuration for the sweep set `data`, with some values replaced.
 
         Args:
-            sets: ``key=value`` each, as on a command line.
-            overrides: fields of `TrainingConfig`.
+            sets: ``key=value`` texts, as on a command line; they replace `overrides` too.
+            overrides: values of fields of `TrainingConfig`.
 
         Raises:
             ConfigError: an unknown key, or an invalid value.
@@ -56,16 +56,16 @@ class Recipe(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def shipped_recipes() -> tuple[str, ...]:
-    """Return the names of the recipes that ship."""
+    """Return the names of the recipes in this package."""
     files = resources.files("tactile_rt.models").joinpath("recipes").iterdir()
     return tuple(sorted(f.name[: -len(".toml")] for f in files if f.name.endswith(".toml")))
 
 
 def load_recipe(name: str) -> Recipe:
-    """Read a recipe.
+    """Read and check a recipe, by a path ending in ".toml" or a shipped name.
 
     Raises:
-        ConfigError: it is missing or damaged; the message names the key.
+        ConfigError: the recipe is missing or invalid; the message names the key.
     """
     if name.endswith(".toml"):
         nodes = settings.read_toml(Path(name))
@@ -84,7 +84,7 @@ def load_recipe(name: str) -> Recipe:
                     f"{node.where}: {what} has no key {key!r}; {settings.hint(key, KEYS)}"
                 )
     _check_fields(nodes, train)
-    # All values to try must be valid, not only the first.
+    # All combinations of values to try must be valid, not only the first.
     for values in product(*(node.value for node in search.value.values())) if search.value else ():
         fields = {**train.value, **dict(zip(search.value, values, strict=True))}
         _check_fields(nodes, replace(search, value=fields))
@@ -92,7 +92,7 @@ def load_recipe(name: str) -> Recipe:
 
 
 def _check_fields(nodes: settings.SettingNode, fields: settings.SettingNode) -> None:
-    """Check the fields of a training; errors name where they stand."""
+    """Check the fields of a training; an error names the place in the file."""
     data = settings.make_node("", nodes.file, 0, nodes.folder)
     tree = replace(nodes, value={"train": replace(fields, value={**fields.value, "data": data})})
     config: TrainingConfig = settings.convert(tree, TrainingConfig, ["train"])
@@ -105,12 +105,12 @@ def _check_fields(nodes: settings.SettingNode, fields: settings.SettingNode) -> 
 
 
 def read_recipe(name: str, data: str, sets: Sequence[str] = (), **overrides: Any) -> TrainingConfig:
-    """Read the training configuration of a recipe.
+    """Read a recipe and return its configuration for the sweep set `data`.
 
     Args:
-        sets: ``key=value`` each, to replace values.
+        sets: ``key=value`` texts that replace values.
 
     Raises:
-        ConfigError: it is missing or damaged, or a value is invalid.
+        ConfigError: the recipe is missing, or a value is invalid.
     """
     return load_recipe(name).config(data, sets, **overrides)

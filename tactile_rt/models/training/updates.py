@@ -1,14 +1,14 @@
-"""Updates of a network: their loss, optimizer and schedule, and how many of a run are done.
+"""Updates of a network: loss, optimizer, schedule, and the stored progress of a run.
 
-An update of a recurrent network is thousands of kernels, each of which takes longer to start than
-to run: on a GPU a graph of them is started once. Optimizers and schedules are those of the paper's
-Table A2, and the ones of the shipped recipe. A parameter may carry its own settings (state-space
-models want them), as in ``parameter._optim = {"lr_scale": 0.1, "weight_decay": 0.0}``; equal
-settings share a group. With ``"stacked"`` each of its rows is a norm's, and would be a tensor of
-its own elsewhere.
+An update of a recurrent network is thousands of kernels, each of which takes longer to launch than
+to run, so on a GPU they are launched as one CUDA graph. Optimizers and schedules are those of the
+paper's Table A2 and of the shipped recipe. A parameter may carry its own settings (state-space
+models need them), as in ``parameter._optim = {"lr_scale": 0.1, "weight_decay": 0.0}``; parameters
+with equal settings share a group. With ``"stacked"`` each row counts as a separate parameter of a
+layer norm.
 
-A run's folder holds `last.pt` and `history.csv`, a line per epoch, both written after each epoch: a
-run that was killed resumes there and ends with the same numbers.
+A run's folder holds `last.pt` and `history.csv` (a line per epoch), both written after each epoch:
+an interrupted run resumes from them and ends with the same results.
 """
 
 import csv
@@ -37,16 +37,17 @@ if TYPE_CHECKING:
     from lightning.fabric import Fabric
 
 MOMENTUM = 0.9
-WARMUP_RATIO = 1e-4  # of "cosine-annealing": the rate begins above it
+WARMUP_RATIO = 1e-4  # of the peak rate: "cosine-annealing" starts just above
 TRUST = 1e-3  # LARS's coefficient (You et al. 2017)
 
 
 @dataclass
 class RunState:
-    """The progress of a run, and all that is needed to resume it.
+    """The state of a run, from which it can be resumed: network, optimizer, schedule, counters.
 
     Attributes:
-        epoch, done: The numbers of epochs and of updates that are done.
+        per_epoch: The number of updates in an epoch.
+        epoch, done: The numbers of finished epochs and updates.
     """
 
     objective: Objective
@@ -68,15 +69,15 @@ class RunState:
         }  # fmt: skip
 
     def state(self) -> dict[str, Any]:
-        """Return the contents of `last.pt`."""
+        """Return the state as the contents of `last.pt`."""
         kept = {name: part.state_dict() for name, part in self._parts.items()}
         return kept | {"epoch": self.epoch, "done": self.done, "best": self.best}
 
     def resume(self, folder: Path) -> None:
-        """Resume from the `last.pt` of a folder, if it exists.
+        """Load the state from a folder's `last.pt`, if it exists.
 
         Raises:
-            ModelError: it, `best.pt` or `history.csv` is damaged, or the best network is gone.
+            ModelError: `last.pt`, `best.pt` or `history.csv` is damaged, or `best.pt` is missing.
         """
         last = folder / "last.pt"
         if not last.exists():
@@ -98,10 +99,10 @@ class RunState:
 
 
 def logged_epochs(path: Path, until: float) -> list[dict[str, str]]:
-    """Read the lines of a run's `history.csv` before an epoch.
+    """Read the lines of a run's `history.csv` for epochs before `until`.
 
     Raises:
-        ModelError: it is damaged, or lines are missing.
+        ModelError: the file is damaged, or lines are missing.
     """
     if until <= 1 or not path.exists():
         return []
@@ -118,12 +119,12 @@ def logged_epochs(path: Path, until: float) -> list[dict[str, str]]:
 
 
 def log_epoch(path: Path, metrics: dict[str, float]) -> None:
-    """Add a line to `history.csv`, in place of those of later epochs.
+    """Append an epoch's line to `history.csv`; remove lines of the same and later epochs.
 
     Raises:
-        OSError: the medium is full, or failed.
+        OSError: the disk is full, or failed.
     """
-    # The line of an epoch that was logged, but not saved before the run was killed, is replaced.
+    # A run that is interrupted between this and `last.pt` repeats the epoch when it resumes.
     old = logged_epochs(path, metrics["epoch"])
     text = io.StringIO()
     writer = csv.DictWriter(text, list(metrics))
@@ -134,14 +135,14 @@ def log_epoch(path: Path, metrics: dict[str, float]) -> None:
 
 
 class LARS(torch.optim.Optimizer):
-    """Layer-wise adaptive rates (You et al. 2017): SGD with a rate for every tensor.
+    """LARS optimizer (You et al. 2017): SGD with a learning rate for every tensor.
 
     The rate of a tensor w with gradient g is multiplied by TRUST |w| / (|g| + decay |w|). Biases,
-    norms and every tensor that is still zero take the plain rate, and the former no decay.
+    norms and tensors that are still zero have the plain rate; biases and norms have no decay.
 
     Args:
         lr, momentum, weight_decay: as in SGD.
-        published: multiply even where |w| = 0, as the paper's code: such tensors never move.
+        published: treat all tensors alike, as the paper's code does; so zero tensors never change.
     """
 
     def __init__(
@@ -157,7 +158,7 @@ class LARS(torch.optim.Optimizer):
 
     @torch.no_grad()
     def step(self, closure: Callable[[], float] | None = None) -> float | None:  # type: ignore[override]
-        """Make one update; `closure`, if given, evaluates the loss anew."""
+        """Update the parameters once; `closure`, if given, computes the loss again."""
         loss = None
         if closure is not None:
             with torch.enable_grad():
@@ -189,7 +190,7 @@ class LARS(torch.optim.Optimizer):
 
 
 def _norm(tensor: torch.Tensor, stacked: bool) -> torch.Tensor:
-    """Return a tensor's norm, or each row's, in a shape to multiply the tensor with."""
+    """Return a tensor's norm or, if stacked, those of its rows, with a broadcastable shape."""
     size: torch.Tensor = torch.linalg.vector_norm(
         tensor, dim=-1 if stacked else None, keepdim=stacked
     )
@@ -202,7 +203,8 @@ def parameter_groups(
     """Group the trained parameters by the settings in their ``_optim``.
 
     Args:
-        learning_rate, weight_decay: of parameters that have none of their own.
+        learning_rate, weight_decay: values for parameters without their own settings.
+        own_rates: False to ignore the parameters' own rates and weight decays.
     """
     groups: dict[tuple[float, float, bool], list[nn.Parameter]] = {}
     for parameter in model.parameters():
@@ -219,7 +221,7 @@ def parameter_groups(
 
 
 def build_optimizer(model: nn.Module, config: TrainingConfig) -> torch.optim.Optimizer:
-    """Build the optimizer of a configuration. Table A2 has a weight decay of 1e-4 for all."""
+    """Build the optimizer of a configuration. The weight decay in Table A2 is always 1e-4."""
     rate, decay = config.learning_rate, config.weight_decay
     groups = parameter_groups(model, rate, decay, config.own_rates)
     if config.optimizer == "sgd":
@@ -234,16 +236,16 @@ def build_optimizer(model: nn.Module, config: TrainingConfig) -> torch.optim.Opt
 def build_schedule(
     optimizer: torch.optim.Optimizer, config: TrainingConfig, updates: int, per_epoch: int = 1
 ) -> LRScheduler:
-    """Build the schedule of a configuration, to be stepped after each of `updates`.
+    """Build the learning-rate schedule of a configuration, to step after every update.
 
-    Time is counted in updates, or, with `rate_per` "epoch", in epochs of `per_epoch` updates, as
-    the paper does.
+    Time counts in updates or, with `rate_per` "epoch", in epochs of `per_epoch` updates, as in the
+    paper. The run has `updates` updates.
 
-    - "step": tenfold down after every `drop_every` of all time (StepLR).
-    - "constant".
-    - "cosine": up from nothing in the warm-up, then a half cosine down to 0.
-    - "cosine-annealing": up from 1e-4 in the warm-up, then a half cosine down to 0.
-    - "one-cycle": Smith and Topin (2018), as torch has it.
+    - "step": divide by ten after every share `drop_every` of the run (StepLR).
+    - "constant": the peak rate.
+    - "cosine": rise linearly from 0 in the warm-up, then fall by a half cosine to 0.
+    - "cosine-annealing": rise from 1e-4 of the peak in the warm-up, then a half cosine down to 0.
+    - "one-cycle": torch's OneCycleLR (Smith and Topin 2018).
     """
     if config.schedule == "one-cycle":
         return OneCycleLR(
@@ -286,16 +288,16 @@ def batch_loss(
     feed: BatchFeed,
     bf16: bool,
 ) -> Callable[[Batch], Tensor]:
-    """Make the function that returns the loss of a batch, ready for `backward`.
+    """Return a function that computes a batch's loss, as a CUDA graph where possible.
 
     Args:
-        wrapped: the objective, as `fabric` has set it up.
-        bf16: whether products are of mixed precision.
+        wrapped: the objective as returned by `fabric.setup`.
+        bf16: True for products in mixed precision.
     """
     device = fabric.device.type
 
     def by_kernels(batch: Batch) -> Tensor:
-        # Not Fabric's, which casts a recurrent network's weights anew at every step.
+        # Not Fabric's autocast, which casts a recurrent network's weights again at every step.
         with torch.autocast(device, torch.bfloat16, enabled=bf16):
             loss: Tensor = wrapped(batch.views, batch.labels, batch.generator)
             return loss
@@ -318,7 +320,7 @@ def batch_loss(
 
 
 class _Loss(nn.Module):
-    """An objective's loss with tensors alone as arguments, as a capture needs."""
+    """An objective's loss with only tensors as arguments, as a CUDA graph requires."""
 
     def __init__(self, objective: Objective) -> None:
         super().__init__()
@@ -332,24 +334,24 @@ class _Loss(nn.Module):
 def capture_loss(
     objective: Objective, seen: Sequence[Tensor], labels: Tensor, bf16: bool
 ) -> Callable[..., Tensor] | None:
-    """Capture the objective's loss as a function of (*seen, labels) of fixed shapes.
+    """Capture an objective's loss as a CUDA graph, a function of (*seen, labels).
 
-    The objective stays as it was, with its running means. While the function is made, no other
-    thread may use the GPU.
+    The shapes are fixed. The objective does not change, including its running means. During the
+    capture no other thread may use the GPU.
 
     Args:
         objective: on a GPU, in training mode.
-        seen, labels: of any batch, as `Objective.loss` takes them.
+        seen, labels: those of any batch, as for `Objective.loss`.
 
     Returns:
         The function; None, with a logged warning, if the objective cannot be captured, e.g.
-        because a part that another package adds branches on values.
+        because a plugin's module branches on values.
     """
     before = {name: buffer.clone() for name, buffer in objective.named_buffers()}
     loss = _Loss(objective).train()
     try:
         with torch.autocast("cuda", torch.bfloat16, enabled=bf16, cache_enabled=False):
-            # In place: from here on the module replays.
+            # In place: from here on calls of the module replay the graph.
             torch.cuda.make_graphed_callables(loss, (*seen, labels), allow_unused_input=True)
     except RuntimeError as error:
         logging.getLogger(__name__).warning(
