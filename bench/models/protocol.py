@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from tactile_rt.models.augmentation import Augmentation, as_published
+from tactile_rt.models.augmentation import Augmentation, augment_as_published
 from tactile_rt.models.encoders.cells import CELLS
 from tactile_rt.models.published_pictures import Draw, as_drawn
 from tactile_rt.models.training.config import SCHEDULES, TrainingConfig
@@ -87,7 +87,7 @@ def windows() -> Tensor:
 
 def view(axis: int, turns: int, reverse: int) -> Tensor:
     """What the published augmentation makes of `windows` once it has drawn this."""
-    return as_published(windows(), axis, turns, bool(reverse))
+    return augment_as_published(windows(), axis, turns, bool(reverse))
 
 
 def pictures(draw: Draw) -> Tensor:

@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from tactile_rt.alignment.json_file import Number, encode, read_json, write_json
-from tactile_rt.alignment.rdm import Floats, upper
+from tactile_rt.alignment.rdm import Floats, upper_indices
 from tactile_rt.alignment.statistics import standard_error
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream.stimuli import STIMULI
@@ -179,7 +179,7 @@ def check_benchmark(benchmark: Benchmark, path: Path) -> None:
         raise ConfigError(f"{path}: stimuli need {FEWEST} to {MOST} names, each another")
     if {*benchmark.stimuli} == {*STIMULI} and benchmark.stimuli != STIMULI:
         raise ConfigError(f"{path}: the six stimuli are in another order than {STIMULI}")
-    pairs = len(upper(number)[0])
+    pairs = len(upper_indices(number)[0])
     for target in benchmark.all_targets:
         if not target.chosen.rdm.shape == target.unfiltered.rdm.shape == (pairs,):
             raise ConfigError(f"{path}: target {target.name}: an RDM has {pairs} entries")

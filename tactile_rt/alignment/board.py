@@ -104,7 +104,7 @@ def traces_of_stimuli(stimuli: StimuliInput) -> Traces:
     return {"raw": steps.reshape(*steps.shape[:2], -1)}
 
 
-def with_cells(
+def compute_board(
     rows: Sequence[tuple[BoardRow, Traces]],
     dataset: NeuralDataset,
     animals: Sequence[Animal],

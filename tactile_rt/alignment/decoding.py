@@ -15,7 +15,7 @@ from itertools import permutations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tactile_rt.alignment.rdm import Floats, rdm, square
+from tactile_rt.alignment.rdm import Floats, rdm, to_matrices
 from tactile_rt.core.stream.stimuli import DISTANCES, SHAPES, STIMULI
 
 Labels = tuple[int, ...]
@@ -51,7 +51,7 @@ def decode_rdm(entries: ArrayLike) -> Decoded:
 
     The null distribution is exact: all 720 relabellings, the true labels included.
     """
-    squares = 2 * square(entries)  # squared Euclidean distances of vectors of length one
+    squares = 2 * to_matrices(entries)  # squared Euclidean distances of vectors of length one
     if not np.isfinite(squares).all():
         return Decoded(*[float("nan")] * 6)
     orders = np.array(list(permutations(range(len(STIMULI)))))

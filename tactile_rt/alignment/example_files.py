@@ -20,7 +20,7 @@ from numpy.typing import ArrayLike, NDArray
 from tactile_rt.alignment.example import MODELS, Brain, example_models, gains
 from tactile_rt.alignment.rdm import Floats
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.files import whole_folder
+from tactile_rt.core.files import replace_folder
 from tactile_rt.core.stream.stimuli import STIMULI
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ def write_example(
     truth, models, mice = (np.random.default_rng([seed, part]) for part in range(3))
     shared = brain.geometry(truth)
     folder.parent.mkdir(parents=True, exist_ok=True)
-    with whole_folder(folder) as made:
+    with replace_folder(folder) as made:
         for part in ("recordings", "models"):
             (made / part).mkdir()
         for name, layers in example_models(brain, models, shared).items():

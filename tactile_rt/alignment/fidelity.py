@@ -34,7 +34,7 @@ class LayerFidelity:
     kept: bool
 
 
-def compare(reference: Layers, exported: Layers) -> tuple[LayerFidelity, ...]:
+def compare_layers(reference: Layers, exported: Layers) -> tuple[LayerFidelity, ...]:
     """Compare every layer that both models have, and their outputs."""
     ours, theirs = reference.patterns, exported.patterns
     begin = reference.first.get("decoder.logits", 0)
@@ -47,9 +47,9 @@ def compare(reference: Layers, exported: Layers) -> tuple[LayerFidelity, ...]:
     )
 
 
-def fidelity_check(reference: Layers, exported: Layers) -> tuple[Check, tuple[LayerFidelity, ...]]:
+def check_fidelity(reference: Layers, exported: Layers) -> tuple[Check, tuple[LayerFidelity, ...]]:
     """Run the fidelity test of the gate; return the result and each layer's comparison."""
-    rows = compare(reference, exported)
+    rows = compare_layers(reference, exported)
     layers = [row for row in rows if row.layer != OUTPUT]
     missing = [name for name in reference.traces if name not in exported.traces]
     bad = [row for row in rows if not row.kept]

@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tactile_rt.alignment.benchmark import Benchmark
-from tactile_rt.alignment.rdm import Floats, count_stimuli, relabellings, square, upper
+from tactile_rt.alignment.rdm import Floats, count_stimuli, relabellings, to_matrices, upper_indices
 from tactile_rt.alignment.scoring import Score
 from tactile_rt.alignment.statistics import held_out, student
 
@@ -50,7 +50,7 @@ NO_FIT = -9.0  # for a layer without a fit: lower than any fit
 @cache
 def _make_contrasts(stimuli: int) -> Floats:
     """Return contrasts (pair, stimulus): 1 at a pair's first stimulus, -1 at the second."""
-    i, j = upper(stimuli)
+    i, j = upper_indices(stimuli)
     return np.eye(stimuli)[i] - np.eye(stimuli)[j]
 
 
@@ -188,7 +188,7 @@ def _compute_gram(rdm: Floats) -> Floats:
     """
     stimuli = count_stimuli(len(rdm))
     centre = np.eye(stimuli) - 1 / stimuli
-    products = -0.5 * centre @ square(rdm) @ centre
+    products = -0.5 * centre @ to_matrices(rdm) @ centre
     values, vectors = np.linalg.eigh(products)
     order = np.argsort(np.abs(vectors.sum(axis=0)))  # the constant vector is last
     values, vectors = values[order[:-1]], vectors[:, order[:-1]]

@@ -7,7 +7,7 @@ import msgspec
 import numpy as np
 
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.files import check_no_pointer, write_whole
+from tactile_rt.core.files import refuse_lfs_pointer, write_whole
 
 T = TypeVar("T")
 LARGEST = 1e12  # largest number in a file: larger numbers cannot be plotted
@@ -33,7 +33,7 @@ def write_json(value: Any, path: Path) -> None:
 
 def read_json(path: Path, kind: type[T], made_by: str) -> T:
     """Read a struct from a file written by `write_json`, and check its kind and version."""
-    check_no_pointer(path)
+    refuse_lfs_pointer(path)
     try:
         return msgspec.json.decode(path.read_bytes(), type=kind, dec_hook=_decode_numbers)
     except OSError as error:

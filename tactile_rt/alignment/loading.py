@@ -15,7 +15,7 @@ from tactile_rt.alignment.stimuli_input import StimuliInput
 from tactile_rt.classifier.model_file import METADATA_KEY, read_model
 from tactile_rt.classifier.onnx_check import BadModel, read_onnx
 from tactile_rt.core.errors import ConfigError, ModelError, explain_errors, name_some
-from tactile_rt.core.files import check_no_pointer
+from tactile_rt.core.files import refuse_lfs_pointer
 from tactile_rt.core.stream.stimuli import STIMULI
 from tactile_rt.models.checkpoints import describe_checkpoint
 
@@ -28,7 +28,7 @@ def check_models(paths: Sequence[Path]) -> tuple[str, ...]:
     """Check that all paths are models, without loading torch; return distinct names.
 
     A model's name is that in its file; for a training run the folder's, in a grid the task's, with
-    parent folders as needed to distinguish runs. `told_apart` makes equal names distinct.
+    parent folders as needed to distinguish runs. `name_apart` makes equal names distinct.
     """
     names: list[str] = []
     runs = {path: path.resolve().parent for path in paths if path.name == BEST}
@@ -43,10 +43,10 @@ def check_models(paths: Sequence[Path]) -> tuple[str, ...]:
     for path in paths:
         own = _read_name(path)
         names.append(called[runs[path]] if path in runs else own)
-    return told_apart(names, paths)
+    return name_apart(names, paths)
 
 
-def told_apart(names: Sequence[str], paths: Sequence[Path]) -> tuple[str, ...]:
+def name_apart(names: Sequence[str], paths: Sequence[Path]) -> tuple[str, ...]:
     """Make names distinct by adding the file's path to a repeated name.
 
     The path has as many parent folders as needed; a file that is given again gets a number.
@@ -107,7 +107,7 @@ def load_layers(
         ConfigError: the stimuli are of another array, or do not fit a foreign model's input.
     """
     if path.suffix == RESPONSES:
-        return responses_layers(path, names), None
+        return read_responses(path, names), None
     if names != STIMULI:
         raise ConfigError(
             f"{path}: the benchmark's {len(names)} stimuli cannot be whisked: give its responses, "
@@ -171,7 +171,7 @@ NUMBERS = "fiu"
 LARGEST = np.finfo(np.float32).max
 
 
-def responses_layers(path: Path, names: tuple[str, ...] = STIMULI) -> Layers:
+def read_responses(path: Path, names: tuple[str, ...] = STIMULI) -> Layers:
     """Read a model's layers from a file of responses.
 
     Args:
@@ -182,7 +182,7 @@ def responses_layers(path: Path, names: tuple[str, ...] = STIMULI) -> Layers:
     Raises:
         ConfigError: no such file, an array that is no layer, or two arrays for one layer.
     """
-    check_no_pointer(path)
+    refuse_lfs_pointer(path)
     try:
         content = path.read_bytes()
     except OSError as error:

@@ -23,7 +23,7 @@ from tactile_rt.alignment.benchmark import FEWEST, MOST
 from tactile_rt.alignment.neural import LARGEST, NeuralSession
 from tactile_rt.alignment.selection import CELLS, Selection
 from tactile_rt.core.errors import ConfigError, explain_errors, name_some
-from tactile_rt.core.files import check_no_pointer
+from tactile_rt.core.files import refuse_lfs_pointer
 from tactile_rt.core.stream.stimuli import STIMULI
 
 SPIKES = ("animal", "session", "unit", "time_s")
@@ -46,7 +46,7 @@ def read_named_npz(path: Path, selection: Selection | None = None) -> list[Neura
     Raises:
         ConfigError: an array is missing or has a wrong shape, or there are not 3 to 50 stimuli.
     """
-    check_no_pointer(path)
+    refuse_lfs_pointer(path)
     with explain_errors(ConfigError, f"{path}: not an npz file of arrays (", most=80):
         with zipfile.ZipFile(path) as archive:
             if (size := sum(member.file_size for member in archive.infolist())) > LARGEST:
@@ -157,7 +157,7 @@ def _make_sessions(
 
 def _identify_table(path: Path) -> tuple[str, ...]:
     """Return the columns of the table in a file: `SPIKES`, `EVENTS`, or () if neither."""
-    check_no_pointer(path)
+    refuse_lfs_pointer(path)
     with explain_errors(ConfigError, f"{path}: cannot be read (", most=80):
         with path.open(newline="", encoding="utf-8-sig") as file:
             head = set(next(csv.reader(file), []))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tactile_rt.alignment.rdm import Floats
 from tactile_rt.core.errors import ConfigError, describe_error, name_some
-from tactile_rt.core.files import check_no_pointer
+from tactile_rt.core.files import refuse_lfs_pointer
 from tactile_rt.core.stream.stimuli import STIMULI
 
 
@@ -149,7 +149,7 @@ def read_published(path: Path) -> dict[str, Floats]:
     The stimulus axis has no names in such a file, so only protocol paper-code can use it; see
     `published_layout`.
     """
-    check_no_pointer(path)
+    refuse_lfs_pointer(path)
     try:
         with zipfile.ZipFile(path) as archive:
             size = sum(member.file_size for member in archive.infolist())

@@ -28,7 +28,7 @@ from tactile_rt.alignment.neural import NeuralSession
 from tactile_rt.alignment.rdm import Floats, stimulus_index
 from tactile_rt.alignment.selection import Selection
 from tactile_rt.core.errors import ConfigError, explain_errors, name_some
-from tactile_rt.core.files import check_no_pointer
+from tactile_rt.core.files import refuse_lfs_pointer
 from tactile_rt.core.packages import require_extra
 from tactile_rt.core.stream.stimuli import DISTANCES, SHAPES
 
@@ -125,7 +125,7 @@ def read_session(
         if value not in known:
             raise ConfigError(f"no {what} {value!r}: there are {name_some(known, 8)}")
     h5py = _import_h5py()
-    check_no_pointer(path)
+    refuse_lfs_pointer(path)
     with explain_errors(ConfigError, f"{path}: cannot be read as NWB ("):
         try:
             with h5py.File(path, "r") as file:

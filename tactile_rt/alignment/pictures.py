@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
-from tactile_rt.alignment.rdm import Floats, square
+from tactile_rt.alignment.rdm import Floats, to_matrices
 
 COLOURS = {
     "raw": "#8a8f98", "encoder": "#c4523a", "attender": "#2f8a58", "decoder": "#3a6fb8",
@@ -151,7 +151,7 @@ def draw_heat_maps(maps: Sequence[tuple[str, Floats]], names: Sequence[str]) -> 
         panel.set_facecolor(MISSING)
         panel.set_title(_escape(title), fontsize=8)
         if np.isfinite(entries).all():
-            panel.pcolormesh(square(entries), cmap="Blues", vmin=0)
+            panel.pcolormesh(to_matrices(entries), cmap="Blues", vmin=0)
         panel.set(aspect="equal", xlim=(0, len(names)), ylim=(len(names), 0))
         left, below = k % MAPS_A_ROW == 0, k + MAPS_A_ROW >= len(maps)
         at = np.arange(len(names)) + 0.5

@@ -36,7 +36,7 @@ def stimulus_index(shape: str, distance: str) -> int:
 
 
 @cache
-def upper(stimuli: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def upper_indices(stimuli: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return rows and columns of the entries above the diagonal of an RDM."""
     return np.triu_indices(stimuli, k=1)
 
@@ -57,7 +57,7 @@ def rdm(patterns: ArrayLike) -> Floats:
     """
     unit_length = normalise_vectors(patterns)
     correlation = np.matmul(unit_length, np.swapaxes(unit_length, -1, -2))
-    i, j = upper(unit_length.shape[-2])
+    i, j = upper_indices(unit_length.shape[-2])
     return np.asarray(1 - correlation[..., i, j])
 
 
@@ -75,11 +75,11 @@ def rsa(a: ArrayLike, b: ArrayLike) -> float:
     return float(pearson(rdm(a), rdm(b)))
 
 
-def square(rdms: ArrayLike) -> Floats:
+def to_matrices(rdms: ArrayLike) -> Floats:
     """Convert RDMs (..., pair) to symmetric matrices (..., n, n) with a zero diagonal."""
     entries = np.asarray(rdms, dtype=np.float64)
     stimuli = count_stimuli(entries.shape[-1])
-    i, j = upper(stimuli)
+    i, j = upper_indices(stimuli)
     matrix = np.zeros((*entries.shape[:-1], stimuli, stimuli))
     matrix[..., i, j] = matrix[..., j, i] = entries
     return matrix
@@ -95,8 +95,8 @@ def relabellings(stimuli: int) -> NDArray[np.intp]:
         (way, pair), 720 ways for six stimuli: ``rdms[..., relabellings(6)[k]]`` are the RDMs after
         relabelling k; the first is the identity.
     """
-    i, j = upper(stimuli)
-    place = square(np.arange(len(i), dtype=np.float64)).astype(np.intp)
+    i, j = upper_indices(stimuli)
+    place = to_matrices(np.arange(len(i), dtype=np.float64)).astype(np.intp)
     if stimuli <= EXACT:
         orders = np.array(list(permutations(range(stimuli))), dtype=np.intp)
     else:

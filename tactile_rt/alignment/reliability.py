@@ -11,7 +11,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tactile_rt.alignment.rdm import Floats, pearson, rdm, upper
+from tactile_rt.alignment.rdm import Floats, pearson, rdm, upper_indices
 from tactile_rt.core.errors import ConfigError
 
 BOOTSTRAPS = 1000
@@ -87,7 +87,7 @@ def half_rdms(rates: ArrayLike, first: NDArray[np.bool_]) -> Floats:
     values = np.where(finite, flat, 0)
     # Sessions are padded to one length, so there are few patterns of missing values.
     patterns, column = _find_distinct_columns(finite)
-    result = np.empty((first.shape[0], 2, len(upper(rates.shape[1])[0])))
+    result = np.empty((first.shape[0], 2, len(upper_indices(rates.shape[1])[0])))
     for begin in range(0, first.shape[0], AT_ONCE):
         part = first[begin : begin + AT_ONCE]
         # Both halves are summed, since differences from the total would make zeros inexact.

@@ -12,7 +12,7 @@ from tactile_rt.alignment.benchmark import Benchmark, benchmark_sha256, check_be
 from tactile_rt.alignment.gate import neural_checks
 from tactile_rt.alignment.json_file import Number, read_json
 from tactile_rt.alignment.layers import Layers
-from tactile_rt.alignment.rdm import Floats, normalise_vectors, upper
+from tactile_rt.alignment.rdm import Floats, normalise_vectors, upper_indices
 from tactile_rt.alignment.scoring import Score, score
 from tactile_rt.alignment.stimuli_input import StimuliInput
 from tactile_rt.core.errors import ConfigError
@@ -61,7 +61,7 @@ def results_of(
     return Results(benchmark, tuple(models), raw, {"file": stimuli.name, "sha256": stimuli.sha256})
 
 
-def model_result(
+def score_model(
     benchmark: Benchmark,
     layers: Layers,
     untrained: Layers | None = None,
@@ -115,7 +115,7 @@ def read_results(path: Path) -> Results:
     results = read_json(path, Results, "tactile-rt align score --json")
     check_benchmark(results.benchmark, path)
     targets = tuple(t.name for t in results.benchmark.all_targets)
-    pairs = len(upper(len(results.benchmark.stimuli))[0])
+    pairs = len(upper_indices(len(results.benchmark.stimuli))[0])
     if results.raw is not None:
         _check_score(results.raw, targets, ("raw",), pairs, f"{path} is damaged: raw sensor input")
     for model in results.models:

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 from tactile_rt.alignment import statistics
 from tactile_rt.alignment.benchmark import Benchmark
 from tactile_rt.alignment.json_file import Number
-from tactile_rt.alignment.rdm import Floats, pearson, rdm, upper
+from tactile_rt.alignment.rdm import Floats, pearson, rdm, upper_indices
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream.stimuli import STIMULI
 
@@ -53,7 +53,7 @@ class Score(msgspec.Struct, frozen=True, eq=False):
 
 def layer_rdms(layers: Mapping[str, ArrayLike], stimuli: int = len(STIMULI)) -> Floats:
     """Compute RDMs (layer, pair) from layers' responses (stimulus, unit)."""
-    rdms = np.empty((len(layers), len(upper(stimuli)[0])))
+    rdms = np.empty((len(layers), len(upper_indices(stimuli)[0])))
     for i, (name, values) in enumerate(layers.items()):
         patterns = np.asarray(values, dtype=np.float64)
         if patterns.ndim != 2 or patterns.shape[0] != stimuli or patterns.shape[1] < 1:
@@ -72,7 +72,7 @@ def score(benchmark: Benchmark, layers: Mapping[str, ArrayLike]) -> Score:
 def score_rdms(benchmark: Benchmark, names: Sequence[str], rdms: ArrayLike) -> Score:
     """Score a model from its layers' RDMs (layer, pair); layers with NaN do not count."""
     rdms = np.asarray(rdms, dtype=np.float64)
-    if not names or rdms.shape != (len(names), len(upper(len(benchmark.stimuli))[0])):
+    if not names or rdms.shape != (len(names), len(upper_indices(len(benchmark.stimuli))[0])):
         raise ConfigError(f"{len(names)} layers and RDMs {rdms.shape} do not fit")
     targets = benchmark.all_targets
     goal = np.array([t.chosen.rdm for t in targets])

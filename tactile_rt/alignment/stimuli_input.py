@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError, describe_error, name_some
-from tactile_rt.core.files import check_no_pointer
+from tactile_rt.core.files import refuse_lfs_pointer
 from tactile_rt.core.stream import ArraySpec
 from tactile_rt.core.stream.sensor_spec import CHANNEL_FLOOR
 from tactile_rt.core.stream.stimuli import STIMULI
@@ -88,7 +88,7 @@ class StimuliInput:
 def read_stimuli(path: Path | None = None) -> StimuliInput:
     """Read a file of `tactile-rt whisk`; without a path, this package's input."""
     path = SHIPPED if path is None else path
-    check_no_pointer(path)
+    refuse_lfs_pointer(path)
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {k: file[k] for k in ("stimuli", "values", "elements", "channels", "units")}

@@ -31,7 +31,7 @@ from numpy.typing import NDArray
 
 from tactile_rt.alignment.benchmark import Benchmark, Consistency, Frozen, Target
 from tactile_rt.alignment.neural import Animal, NeuralSession, rates_sha256
-from tactile_rt.alignment.rdm import CONSTANT, Floats, normalise_vectors, pearson, upper
+from tactile_rt.alignment.rdm import CONSTANT, Floats, normalise_vectors, pearson, upper_indices
 from tactile_rt.alignment.reliability import BOOTSTRAPS, SEED, spearman_brown
 from tactile_rt.core.errors import ConfigError, name_some
 
@@ -64,7 +64,7 @@ class Moments:
         scale = np.diagonal(self.products, axis1=-2, axis2=-1)
         deviation = np.sqrt(np.where(variance > np.sqrt(CONSTANT) * scale, variance, np.nan))
         correlation = covariance / (deviation[..., :, None] * deviation[..., None, :])
-        i, j = upper(correlation.shape[-1])
+        i, j = upper_indices(correlation.shape[-1])
         return np.asarray(1 - correlation[..., i, j])
 
 

@@ -14,7 +14,7 @@ from tactile_rt.calibration.calibration_fit import (
     Fit,
     LoadTable,
     calibrate,
-    raw_readings,
+    median_readings,
     read_loads,
 )
 from tactile_rt.calibration.device_calibration import Calibration, Mirror
@@ -33,7 +33,7 @@ __all__ = [
     "declare",
     "declare_calibration",
     "load_calibration",
-    "raw_readings",
+    "median_readings",
     "read_loads",
     "save_calibration",
     "tare",

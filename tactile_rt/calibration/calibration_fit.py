@@ -81,7 +81,7 @@ def read_loads(path: Path) -> LoadTable:
     )
 
 
-def raw_readings(
+def median_readings(
     table: LoadTable, recorded: Chunk, spec: ArraySpec, element: str
 ) -> NDArray[np.float64]:
     """Return the median reading of an element under each load of a table, (row, channel).

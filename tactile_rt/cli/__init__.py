@@ -28,9 +28,9 @@ def main() -> None:
     _open_streams()
     if sys.argv[1:2] == ["run"] and not any(a.startswith("--source") for a in sys.argv):
         # The daemon also obeys signals that come before everything is imported.
-        from tactile_rt.daemon.process import note_signals
+        from tactile_rt.daemon.process import queue_signals
 
-        note_signals()
+        queue_signals()
     if sys.argv[1:2] == ["teach"]:  # two threads of numpy's libraries take 30 times as long as one
         os.environ.setdefault("OMP_NUM_THREADS", "1")
     with _catch_signals() as received:

@@ -116,7 +116,7 @@ def score_models(
             import matplotlib  # noqa: F401
         from tactile_rt.alignment.benchmark import load_benchmark
         from tactile_rt.alignment.loading import check_models, load_layers, load_untrained
-        from tactile_rt.alignment.results import ModelResult, model_result, results_of
+        from tactile_rt.alignment.results import ModelResult, results_of, score_model
         from tactile_rt.alignment.stimuli_input import read_stimuli
 
         felt, frozen = read_stimuli(stimuli), load_benchmark(benchmark)
@@ -128,7 +128,7 @@ def score_models(
                 layers, own = load_layers(path, felt, input_name, frozen.stimuli)
                 layers = replace(layers, name=name)
                 before = load_untrained(path, felt, seed)
-                done.append(model_result(frozen, layers, before, own))
+                done.append(score_model(frozen, layers, before, own))
                 update(advance=1)
     results = results_of(frozen, felt, done)
     if page:
@@ -149,7 +149,7 @@ def write_report(
     import msgspec
 
     from tactile_rt.alignment.benchmark import benchmark_sha256
-    from tactile_rt.alignment.loading import told_apart
+    from tactile_rt.alignment.loading import name_apart
     from tactile_rt.alignment.results import read_results
 
     check_output(out)
@@ -161,7 +161,7 @@ def write_report(
                 f"{path} was scored on another benchmark or other stimuli than {scores[0]}"
             )
     found = [(model, path) for path, one in zip(scores, read, strict=True) for model in one.models]
-    names = told_apart([model.name for model, _ in found], [path for _, path in found])
+    names = name_apart([model.name for model, _ in found], [path for _, path in found])
     models = tuple(
         msgspec.structs.replace(model, name=name)
         for (model, _), name in zip(found, names, strict=True)

@@ -112,9 +112,9 @@ def write_board(
         raise ConfigError("name recordings: --data NAME=PATH, see `tactile-rt align datasets`")
     parts, models = list(dict.fromkeys(part or ["all"])), models or []
     with needing("train"):
-        from tactile_rt.alignment.board import join_boards, with_cells
+        from tactile_rt.alignment.board import compute_board, join_boards
         from tactile_rt.alignment.datasets import find_dataset
-        from tactile_rt.alignment.loading import check_models, told_apart
+        from tactile_rt.alignment.loading import check_models, name_apart
         from tactile_rt.alignment.metrics import find_metric, metric_names
         from tactile_rt.alignment.selection import part_of
         from tactile_rt.alignment.stimuli_input import read_stimuli
@@ -125,7 +125,7 @@ def write_board(
         for name in parts:
             part_of((), name)
         sources = [_parse_data(text) for text in data]
-        distinct = told_apart([name for name, _ in sources], [path for _, path in sources])
+        distinct = name_apart([name for name, _ in sources], [path for _, path in sources])
         datasets = [
             (replace(find_dataset(name), name=own), path)
             for (name, path), own in zip(sources, distinct, strict=True)
@@ -145,7 +145,7 @@ def write_board(
                     )
                 rows = _make_rows(files, read.stimuli or felt, seed, update, names)
             with share_bar(f"scoring on {dataset.name}") as tell:
-                made = with_cells(rows, dataset, read.animals, parts, metrics, read.notes, tell)
+                made = compute_board(rows, dataset, read.animals, parts, metrics, read.notes, tell)
             boards.append(made)
         made = join_boards(boards)
     if page:

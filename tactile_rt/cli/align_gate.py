@@ -76,7 +76,7 @@ def _gate(
         raise ConfigError("--baseline needs the --benchmark that it was scored on")
     with needing("train"):
         from tactile_rt.alignment.benchmark import load_strict
-        from tactile_rt.alignment.fidelity import export_layers, fidelity_check
+        from tactile_rt.alignment.fidelity import check_fidelity, export_layers
         from tactile_rt.alignment.gate import Check, exit_code, neural_checks
         from tactile_rt.alignment.loading import check_models, load_layers
         from tactile_rt.alignment.results import baseline_of
@@ -93,7 +93,7 @@ def _gate(
             original, _ = load_layers(reference, felt)
             is_onnx = model.suffix == ".onnx"
             made = export_layers(model, felt, original) if is_onnx else load_layers(model, felt)[0]
-            check, found = fidelity_check(original, made)
+            check, found = check_fidelity(original, made)
             checks.append(check)
             rows += found
         if frozen is not None:

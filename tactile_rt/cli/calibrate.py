@@ -99,7 +99,7 @@ def calibrate(
     from tactile_rt.calibration import (
         Calibration,
         calibration_path,
-        raw_readings,
+        median_readings,
         read_loads,
         save_calibration,
     )
@@ -127,7 +127,7 @@ def calibrate(
     element = element or target.elements[0]
     try:
         if len(loads.times):
-            raw = raw_readings(loads, recorded, spec, element)
+            raw = median_readings(loads, recorded, spec, element)
         else:
             raw = loads.raw
         raw = raw[:, _match_channels(fresh.channels, target)]

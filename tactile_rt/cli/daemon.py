@@ -217,7 +217,7 @@ def ros2_messages(
     """Write tactile_rt_msgs, the ROS 2 package of our message types."""
     import shutil
 
-    from tactile_rt.core.files import whole_folder
+    from tactile_rt.core.files import replace_folder
     from tactile_rt.recording.ros2.cdr import PACKAGE
 
     made = folder / PACKAGE.name
@@ -225,7 +225,7 @@ def ros2_messages(
         raise ConfigError(f"no folder {folder}")
     if made.exists():
         raise ConfigError(f"{made} is there already")
-    with whole_folder(made) as unfinished:
+    with replace_folder(made) as unfinished:
         shutil.copytree(PACKAGE, unfinished, dirs_exist_ok=True)
     typer.echo(f"{made} is written; build it with: colcon build --packages-select {PACKAGE.name}")
 

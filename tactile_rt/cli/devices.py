@@ -20,12 +20,12 @@ LOG_BYTES = 1 << 16  # size of a log's end that is searched for the newest warni
 @app.command("list", epilog="tactile-rt list")
 def list_devices(json: Json = None) -> None:
     """List serial ports and CAN buses, and the URL of each sensor."""
-    from tactile_rt.drivers.discovery import can_buses, serial_ports
+    from tactile_rt.drivers.discovery import list_can_buses, serial_ports
 
     found = [
         {"device": port.path, "likely": port.likely, "url": port.url} for port in serial_ports()
     ]
-    for bus in can_buses():
+    for bus in list_can_buses():
         rate = f", {bus.bitrate} bit/s" if bus.bitrate else ""
         likely = f"CAN bus, {'up' if bus.up else 'down'}{rate}"
         found.append({"device": bus.name, "likely": likely, "url": bus.url})
@@ -51,14 +51,14 @@ def doctor(
     from rich.markup import escape
 
     from tactile_rt.core.files import write_whole
-    from tactile_rt.drivers.discovery import can_buses, diagnose, serial_ports, udev_rules
+    from tactile_rt.drivers.discovery import diagnose, list_can_buses, serial_ports, udev_rules
 
     check_output(udev)
     ports = serial_ports()
     if daemon:
         findings = _look_at_daemon(daemon)
     else:
-        findings = [*diagnose(ports, can_buses()), *_look_at_simulator()]
+        findings = [*diagnose(ports, list_can_buses()), *_look_at_simulator()]
     alone = told_as_json(findings, json)
     console = Console(stderr=alone, soft_wrap=True, highlight=False)
     for finding in () if alone else findings:

@@ -14,7 +14,7 @@ from tactile_rt.cli.app import app, check_is_mcap, check_new, check_output, need
 from tactile_rt.cli.options import Force, Json, argument, option
 from tactile_rt.cli.tables import progress_bar, told_as_json
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.files import check_no_pointer
+from tactile_rt.core.files import refuse_lfs_pointer
 
 if TYPE_CHECKING:
     from tactile_rt.recording.importing.report import Import
@@ -65,7 +65,7 @@ def import_file(
         raise ConfigError(f"no file {log}")
     if log.is_file() and not log.stat().st_size:
         raise ConfigError(f"{log} is empty")
-    check_no_pointer(log)
+    refuse_lfs_pointer(log)
     output = output or Path(f"{log.name.partition('.')[0] or 'import'}.mcap")
     check_is_mcap(output)
     check_new(output, force)

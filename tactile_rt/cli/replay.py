@@ -80,7 +80,7 @@ class _Replay:
         fields: dict[str, str],
     ) -> None:
         from tactile_rt.classifier.model_file import hash_of, shipped_model
-        from tactile_rt.recording.checking import file_of_model, live_model
+        from tactile_rt.recording.checking import choose_model_file, live_model
 
         model = shipped_model() if model == Path("shipped") else model
         self.files, self._fields = files, fields
@@ -89,7 +89,7 @@ class _Replay:
         self._first = self._last = 0  # stream time, ns
         self._begins_at = 0
         self._live = live_model(str(files[0].path), files[0].description, name, model, check)
-        self._model = file_of_model(model, self._live)
+        self._model = choose_model_file(model, self._live)
         name = self._live.name if self._live and check else ""
         self._skips = [s for f in files for s in f.skips(name)] if name else []
         sha256 = hash_of(self._model)

@@ -47,7 +47,7 @@ def train(
     json: Json = None,
 ) -> None:
     """Train an encoder-attender-decoder network on a sweep set."""
-    from tactile_rt.models.checkpoints import describe_checkpoint, network_of
+    from tactile_rt.models.checkpoints import describe_checkpoint, read_network_options
     from tactile_rt.models.training.recipes import read_recipe
 
     asked = {"encoder": encoder, "epochs": epochs, "seed": seed}
@@ -57,7 +57,7 @@ def train(
     if also:
         given["also"] = tuple(map(str, also))
     if begin is not None:
-        given = {**network_of(begin), **given, "begin": str(begin)}
+        given = {**read_network_options(begin), **given, "begin": str(begin)}
     config = read_recipe(recipe, str(data), sets or (), **given)
     first = os.environ.get("RANK", "0") == "0"  # the first of torchrun's processes, or the only one
     # Refuse what cannot be trained before torch is imported, which takes seconds.

@@ -21,7 +21,7 @@ def is_pointer(begins: bytes) -> bool:
     return begins.startswith(_LFS)
 
 
-def check_no_pointer(path: Path) -> None:
+def refuse_lfs_pointer(path: Path) -> None:
     """Refuse a Git LFS pointer; ignore a file that cannot be read.
 
     Raises:
@@ -141,7 +141,7 @@ def replace_file(path: Path) -> Iterator[BinaryIO]:
 
 
 @contextmanager
-def whole_folder(path: Path) -> Iterator[Path]:
+def replace_folder(path: Path) -> Iterator[Path]:
     """Yield a new folder to fill, which replaces `path` when the block succeeds.
 
     Until then it is hidden: ``.NAME.XXXXXXXX`` beside it. If the block fails, nothing has changed.

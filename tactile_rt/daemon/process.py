@@ -1,7 +1,7 @@
 """The daemon as a process: signals, exit codes, one instance.
 
 A process must obey signals from its first line on, but its imports take a good part of a second. So
-`note_signals` comes first, before anything heavy, and `run_daemon` looks at the noted signals
+`queue_signals` comes first, before anything heavy, and `run_daemon` looks at the noted signals
 before it starts anything. That is why this module itself imports almost nothing.
 """
 
@@ -48,7 +48,7 @@ class ExitCode(IntEnum):
     ABANDONED = 4  # stopped, but a part did not end in time and may not have written everything
 
 
-def note_signals() -> None:
+def queue_signals() -> None:
     """Queue signals from now on, so that `run_daemon` also obeys earlier ones.
 
     The handlers stay, so that no signal ends the process while Python shuts down."""

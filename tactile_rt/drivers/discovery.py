@@ -1,6 +1,6 @@
 """Discovery of serial ports and CAN buses, the devices likely on them, and their problems.
 
-`serial_ports` and `can_buses` list them, each with a URL to start from; `diagnose` checks
+`serial_ports` and `list_can_buses` list them, each with a URL to start from; `diagnose` checks
 permissions, latency timers and the state of buses, and suggests remedies; `udev_rules` makes part
 of these permanent.
 """
@@ -110,7 +110,7 @@ def serial_ports(by_id: Path = Path("/dev/serial/by-id")) -> list[Port]:
     return found
 
 
-def can_buses(net: Path = Path("/sys/class/net")) -> list[CanBus]:
+def list_can_buses(net: Path = Path("/sys/class/net")) -> list[CanBus]:
     """Return the CAN network interfaces of this machine (Linux)."""
     found = []
     for link in sorted(net.iterdir()) if net.is_dir() else ():

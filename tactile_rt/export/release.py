@@ -89,7 +89,7 @@ def release(
     return _add_figures(path, card, quantisation_figures(run_on(model), path, validation))
 
 
-def run_file(path: Path) -> Step:
+def load_runner(path: Path) -> Step:
     """Load a model file, step or window, as a function for `evaluation.measures.predict`."""
     session, card = load_model(path, kind=None)
 
@@ -113,7 +113,7 @@ def quantisation_figures(trained: Step, path: Path, sweeps: SweepSet) -> dict[st
     classes = len(sweeps.manifest.categories)
     before, after = (
         np.concatenate([among(predict(sweeps, run, n)[:, -1], classes) for n in (0.0, 1.0)])
-        for run in (trained, run_file(path))
+        for run in (trained, load_runner(path))
     )
     labels = np.tile(sweeps.sweeps.labels, 2)
     decided = ~np.isnan(before[:, 0])

@@ -294,10 +294,10 @@ def tactile_paper(frames: Tensor, generator: Generator, channels: int = 6) -> Te
 
     axis, flipped, turns, reverse = (draw(n) for n in (2, 2, 4, 2))
     mirrored = (-1, -2)[axis] if flipped else 0
-    return as_published(frames, mirrored, turns, bool(reverse), channels)
+    return augment_as_published(frames, mirrored, turns, bool(reverse), channels)
 
 
-def as_published(
+def augment_as_published(
     frames: Tensor, mirrored: int, turns: int, reverse: bool, channels: int = 6
 ) -> Tensor:
     """Flip, rotate and reverse frames as `tactile_paper` does, with the given parameters.

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 
 from tactile_rt.core.errors import ConfigError, ModelError, RecordingError, SpecMismatch
-from tactile_rt.core.files import check_no_pointer, open_regular, replace_file
+from tactile_rt.core.files import open_regular, refuse_lfs_pointer, replace_file
 from tactile_rt.core.stream import ArraySpec
 from tactile_rt.core.stream.sensor_spec import ChannelLimits
 from tactile_rt.models.ead_config import EADConfig
@@ -41,7 +41,7 @@ def describe_checkpoint(path: Path) -> dict[str, Any]:
     Raises:
         ModelError: the file is missing or no `best.pt`; the values of tensors are not checked.
     """
-    check_no_pointer(path)
+    refuse_lfs_pointer(path)
     try:
         with open_regular(path) as file, zipfile.ZipFile(file) as archive:
             names = [name for name in archive.namelist() if name.endswith(PICKLE)]
@@ -62,7 +62,7 @@ def describe_checkpoint(path: Path) -> dict[str, Any]:
     return found
 
 
-def network_of(path: Path) -> dict[str, Any]:
+def read_network_options(path: Path) -> dict[str, Any]:
     """Read a network's options from a checkpoint, for use in a training configuration."""
     network = describe_checkpoint(path)["network"]
     return {key: value for key, value in network.items() if key in NETWORK}

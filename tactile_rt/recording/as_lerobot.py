@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError, RecordingError, SpecMismatch
-from tactile_rt.core.files import whole_folder
+from tactile_rt.core.files import replace_folder
 from tactile_rt.core.stream import NS_PER_S, ArraySpec, Chunk
 from tactile_rt.recording import lerobot_meta as meta
 from tactile_rt.recording.conversion import about_text
@@ -70,7 +70,7 @@ def write_dataset(
     width = max(int(np.diff(end, prepend=0).max()) for end in ends)
     schema = _make_schema(pa, spec, width)
     n, first, episodes = 0, 0, []
-    with whole_folder(folder) as made:
+    with replace_folder(folder) as made:
         tasks: dict[str, int] = {}
         for k, (recording, end) in enumerate(zip(recordings, ends, strict=True)):
             about = recording.description

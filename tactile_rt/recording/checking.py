@@ -91,7 +91,7 @@ def live_model(
     return named[0]
 
 
-def file_of_model(model: Path | None, live: RecordedModel | None) -> Path:
+def choose_model_file(model: Path | None, live: RecordedModel | None) -> Path:
     """Return the model file to replay: `model`, else the live model's, else the shipped one.
 
     Raises:

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError, RecordingError
-from tactile_rt.core.files import whole_folder, write_whole
+from tactile_rt.core.files import replace_folder, write_whole
 from tactile_rt.core.packages import require_extra
 from tactile_rt.core.stream import Chunk, concatenate
 from tactile_rt.recording.description import RECOVERED, Description, seal
@@ -239,7 +239,7 @@ def write_bag(recordings: Sequence[Recording], folder: Path) -> int:
         folder: The bag to write; an existing one is replaced.
     """
     n = 0
-    with whole_folder(folder) as made:
+    with replace_folder(folder) as made:
         files = []
         for k, recording in enumerate(recordings):
             name = f"{folder.name}_{k}.mcap"

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.files import whole_folder
+from tactile_rt.core.files import replace_folder
 from tactile_rt.core.packages import VERSION
 from tactile_rt.recording.labelling import LabelledTouch, LabelledTouches
 from tactile_rt.recording.touches import REST
@@ -69,7 +69,7 @@ def write_set(
         versions={"tactile_rt": VERSION, "numpy": np.__version__},
         version=RECORDED_VERSION,
     )
-    with whole_folder(folder) as made:
+    with replace_folder(folder) as made:
         manifest.write(made)
         for name, used in objects.items():
             about: dict[str, Any] = {

@@ -20,7 +20,7 @@ from pathlib import Path
 import msgspec
 
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.files import check_no_pointer, open_regular, sync_folder, write_whole
+from tactile_rt.core.files import open_regular, refuse_lfs_pointer, sync_folder, write_whole
 from tactile_rt.core.settings import check_columns, convert, nearest, read_csv, refusal
 
 LABELS = "labels.csv"  # beside the recordings
@@ -66,7 +66,7 @@ def read_labels(path: Path, recordings: Sequence[Path]) -> dict[Path, list[Label
         ConfigError: the file cannot be read, or a line is wrong; names file, line and column, and
             what to do.
     """
-    check_no_pointer(path)
+    refuse_lfs_pointer(path)
     table = read_csv(path)
     check_columns(table, COLUMNS, NEEDED)
     if "recording" not in table.columns and len(recordings) > 1:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tactile_rt.core.errors import ConfigError, RecordingError, name_some
-from tactile_rt.core.files import check_no_pointer, write_whole
+from tactile_rt.core.files import refuse_lfs_pointer, write_whole
 from tactile_rt.sets.manifest import (
     CONTACTS,
     NEW_SWEEPS,
@@ -214,7 +214,7 @@ def _read_shape(path: Path, shape: tuple[int, int]) -> tuple[int, ...]:
 
 def read_arrays(path: Path, *keys: str) -> dict[str, NDArray[Any]]:
     """Read the named arrays from an object's file, or all without names; skip missing names."""
-    check_no_pointer(path)
+    refuse_lfs_pointer(path)
     try:
         # Opened here because numpy leaves its own file open when it is damaged.
         with path.open("rb") as file, np.load(file) as arrays:

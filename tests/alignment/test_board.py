@@ -10,10 +10,10 @@ from tactile_rt.alignment import board as boards
 from tactile_rt.alignment.board import (
     ANOTHER,
     BoardRow,
+    compute_board,
     join_boards,
     traces_of,
     traces_of_stimuli,
-    with_cells,
 )
 from tactile_rt.alignment.board_page import board_page
 from tactile_rt.alignment.datasets import DATASETS, dataset_names, find_dataset
@@ -45,7 +45,7 @@ def made():
         (BoardRow("raw sensor input", "input"), {"raw": layers["encoder.noise"]}),
     ]
     dataset = find_dataset("example")
-    board = with_cells(rows, dataset, animals, ("all", "L4"), METRICS, ("left out: x",))
+    board = compute_board(rows, dataset, animals, ("all", "L4"), METRICS, ("left out: x",))
     return board, animals, layers
 
 
@@ -71,7 +71,7 @@ def test_one_thread_measures_whatever_others_use(made, monkeypatch):
 
     monkeypatch.setattr(boards, "find_metric", lambda name: metric)
     with threadpoolctl.threadpool_limits(2):
-        with_cells([], find_dataset("example"), made[1], ("all",), ("mine",))
+        compute_board([], find_dataset("example"), made[1], ("all",), ("mine",))
     assert seen and set(seen) == {1}
 
 

@@ -16,7 +16,7 @@ from tactile_rt.alignment.layers import Layers
 from tactile_rt.alignment.neural import read_published
 from tactile_rt.alignment.nwb import WINDOWS, read_nwb, read_session
 from tactile_rt.alignment.report import report_page
-from tactile_rt.alignment.results import model_result, read_results, results_of
+from tactile_rt.alignment.results import read_results, results_of, score_model
 from tactile_rt.alignment.stimuli_input import SHIPPED, read_stimuli
 from tactile_rt.alignment.strict import freeze_strict
 from tactile_rt.core.errors import ConfigError
@@ -233,7 +233,7 @@ def scores(tmp_path_factory):
         logits = np.zeros((6, 1, 2), np.float32)
         of = {"masking": masking}
         layers = Layers("model", traces, {"encoder.0": 0}, logits, 1, training=of)
-        made.append(model_result(benchmark, layers, layers))
+        made.append(score_model(benchmark, layers, layers))
     path = tmp_path_factory.mktemp("scores") / "scores.json"
     write_json(results_of(benchmark, FELT, made), path)
     assert "0.5" in report_page(read_results(path))

@@ -19,9 +19,9 @@ onnx = pytest.importorskip("onnx")
 
 from tactile_rt.alignment.activations import network_layers  # noqa: E402
 from tactile_rt.alignment.fidelity import (  # noqa: E402
-    compare,
+    check_fidelity,
+    compare_layers,
     export_layers,
-    fidelity_check,
 )
 from tactile_rt.alignment.layers import Layers  # noqa: E402
 from tactile_rt.alignment.onnx_activations import onnx_layers  # noqa: E402
@@ -177,7 +177,7 @@ def damaged(source, path, matching):
 
 def test_a_faithful_export_passes(exported):
     reference, path = exported
-    check, rows = fidelity_check(reference, export_layers(path, FELT, reference))
+    check, rows = check_fidelity(reference, export_layers(path, FELT, reference))
     assert check.code == gate.PASS
     assert [row.layer for row in rows] == [*reference.traces, "output"]
     assert min(row.pearson for row in rows) >= 0.9999
@@ -220,7 +220,7 @@ def test_a_file_averages_the_steps_of_its_checkpoint(tmp_path, encoder, attender
         assert onnx_layers(path, felt)[0].first == reference.first
     found = export_layers(path, late, reference)
     assert {name: found.first[name] for name in reference.first} == reference.first
-    assert fidelity_check(reference, found)[0].code == gate.PASS
+    assert check_fidelity(reference, found)[0].code == gate.PASS
 
 
 def test_the_checkpoint_says_which_steps_count(exported, monkeypatch):
@@ -234,7 +234,7 @@ def test_the_checkpoint_says_which_steps_count(exported, monkeypatch):
     monkeypatch.setattr("tactile_rt.alignment.onnx_activations.onnx_layers", late)
     found = export_layers(path, FELT, reference)
     assert {name: found.first[name] for name in reference.first} == reference.first
-    assert fidelity_check(reference, found)[0].code == gate.PASS
+    assert check_fidelity(reference, found)[0].code == gate.PASS
 
 
 @pytest.mark.parametrize("precision", ["fp16", "bf16"])
@@ -246,7 +246,7 @@ def test_a_gpt_of_weights_in_16_bits_passes(tmp_path, precision):
     reference = network_layers(model, FELT)
     layers = export_layers(path, FELT, reference)
     assert layers.precision == precision
-    assert fidelity_check(reference, layers)[0].code == gate.PASS
+    assert check_fidelity(reference, layers)[0].code == gate.PASS
 
 
 def test_layers_that_are_alike_in_an_export_are_not_compared_and_it_says_so(tmp_path):
@@ -254,7 +254,7 @@ def test_layers_that_are_alike_in_an_export_are_not_compared_and_it_says_so(tmp_
     path = tmp_path / "step.onnx"
     model = written(path, "gru", "gpt", "linear", trained=False)
     reference = network_layers(model, FELT)
-    check, rows = fidelity_check(reference, export_layers(path, FELT, reference))
+    check, rows = check_fidelity(reference, export_layers(path, FELT, reference))
     assert check.code == gate.PASS and "layers could not be compared" in check.why
     assert "attender.block0" not in {row.layer for row in rows}
 
@@ -263,13 +263,13 @@ def test_an_int8_export_passes_and_a_damaged_one_fails(exported, quantised, tmp_
     reference, _ = exported
     layers = export_layers(quantised, FELT, reference)
     assert layers.precision == "int8"
-    check, rows = fidelity_check(reference, layers)
+    check, rows = check_fidelity(reference, layers)
     assert check.code == gate.PASS
     assert len(rows) == len(reference.traces) + 1
     assert min(row.pearson for row in rows) >= 0.98
 
     bad = damaged(quantised, tmp_path / "bad.onnx", lambda name, v: v.dtype in (np.int8, np.uint8))
-    check, _ = fidelity_check(reference, export_layers(bad, FELT, reference))
+    check, _ = check_fidelity(reference, export_layers(bad, FELT, reference))
     assert check.code == gate.FAIL
 
 
@@ -277,7 +277,7 @@ def test_one_damaged_layer_is_named(exported, tmp_path):
     reference, path = exported
     last = reference.logits.shape[-1]
     bad = damaged(path, tmp_path / "bad.onnx", lambda name, v: last in v.shape)
-    check, rows = fidelity_check(reference, export_layers(bad, FELT, reference))
+    check, rows = check_fidelity(reference, export_layers(bad, FELT, reference))
     assert check.code == gate.FAIL
     assert {row.layer for row in rows if not row.kept} == {"decoder.logits", "output"}
     assert "decoder.logits" in check.why or "output" in check.why
@@ -285,7 +285,7 @@ def test_one_damaged_layer_is_named(exported, tmp_path):
 
 def test_another_network_fails(exported):
     reference, _ = exported
-    check, _ = fidelity_check(reference, onnx_layers(shipped_model(), FELT)[0])
+    check, _ = check_fidelity(reference, onnx_layers(shipped_model(), FELT)[0])
     assert check.code == gate.FAIL
 
 
@@ -298,8 +298,8 @@ def test_a_small_difference_misses_single_precision_but_not_int8(exported):
         for n, t in same.traces.items()
     }
     other = replace(same, traces=moved)
-    assert fidelity_check(reference, other)[0].code == gate.FAIL
-    assert fidelity_check(reference, replace(other, precision="int8"))[0].code == gate.PASS
+    assert check_fidelity(reference, other)[0].code == gate.FAIL
+    assert check_fidelity(reference, replace(other, precision="int8"))[0].code == gate.PASS
 
 
 def test_an_rdm_that_says_nothing_is_not_compared():
@@ -311,10 +311,10 @@ def test_an_rdm_that_says_nothing_is_not_compared():
         Layers(n, {"encoder.0": trace}, {"encoder.0": 0}, np.float32(depth * (1, -0.97) + error), 1)
         for n, error, trace in zip("ab", rounded, [rng.normal(size=(6, 22, 9))] * 2, strict=True)
     )
-    check, rows = fidelity_check(a, b)
+    check, rows = check_fidelity(a, b)
     assert check.verdict == "pass" and "least alike encoder.0" in check.why
     output = next(row for row in rows if row.layer == "output")
     assert output.kept and np.isnan(output.pearson)
     # one that is not flat any more is compared, and found to be another
     turned = replace(b, logits=b.logits * np.float32([1, -1]))
-    assert not next(r for r in compare(a, turned) if r.layer == "output").kept
+    assert not next(r for r in compare_layers(a, turned) if r.layer == "output").kept

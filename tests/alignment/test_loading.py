@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tactile_rt.alignment.loading import check_models, responses_layers, told_apart
+from tactile_rt.alignment.loading import check_models, name_apart, read_responses
 from tactile_rt.classifier.model_file import shipped_model
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.models.grid.outcomes import POINT
@@ -76,7 +76,7 @@ def test_files_of_one_name_are_told_apart_by_the_folders_above(tmp_path):
 
 def test_no_name_that_is_made_is_one_that_is_there():
     paths = [Path(f"/runs/{name}") for name in ("a.onnx", "b.onnx", "c.onnx", "b.onnx")]
-    assert told_apart(["m (b.onnx)", "m", "m", "m"], paths) == (
+    assert name_apart(["m (b.onnx)", "m", "m", "m"], paths) == (
         "m (b.onnx)", "m", "m (c.onnx)", "m (b.onnx, 2)"
     )  # fmt: skip
 
@@ -87,7 +87,7 @@ RNG = np.random.default_rng(0)
 def test_a_layer_is_of_the_encoder_unless_its_name_says_so(tmp_path):
     arrays = {"stem": RNG.normal(size=(6, 4)), "decoder.fc1": RNG.normal(size=(6, 22, 3))}
     np.savez(tmp_path / "a.npz", **arrays)
-    traces = responses_layers(tmp_path / "a.npz").traces
+    traces = read_responses(tmp_path / "a.npz").traces
     assert {name: trace.shape for name, trace in traces.items()} == {
         "encoder.stem": (6, 1, 4),
         "decoder.fc1": (6, 22, 3),
@@ -98,7 +98,7 @@ def test_a_layer_is_of_the_encoder_unless_its_name_says_so(tmp_path):
 def test_no_layer_takes_the_place_of_another(tmp_path, names):
     np.savez(tmp_path / "a.npz", **{name: RNG.normal(size=(6, 4)) for name in names})
     with pytest.raises(ConfigError, match=r"arrays stem and encoder\.stem are one layer"):
-        responses_layers(tmp_path / "a.npz")
+        read_responses(tmp_path / "a.npz")
 
 
 @pytest.mark.parametrize(
@@ -114,12 +114,12 @@ def test_no_layer_takes_the_place_of_another(tmp_path, names):
 def test_what_is_no_layer_is_refused(tmp_path, arrays, said):
     np.savez(tmp_path / "a.npz", **arrays)
     with pytest.raises(ConfigError, match=said):
-        responses_layers(tmp_path / "a.npz")
+        read_responses(tmp_path / "a.npz")
 
 
 def test_what_is_no_archive_is_refused(tmp_path):
     (tmp_path / "a.npz").write_bytes(b"PK nonsense")
     with pytest.raises(ConfigError, match="no archive of arrays"):
-        responses_layers(tmp_path / "a.npz")
+        read_responses(tmp_path / "a.npz")
     with pytest.raises(ConfigError, match="cannot be read"):
-        responses_layers(tmp_path / "none.npz")
+        read_responses(tmp_path / "none.npz")

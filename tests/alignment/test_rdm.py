@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from tactile_rt.alignment.rdm import pearson, rdm, relabellings, rsa, square, stimulus_index
+from tactile_rt.alignment.rdm import pearson, rdm, relabellings, rsa, stimulus_index, to_matrices
 from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream.stimuli import STIMULI
 
@@ -53,7 +53,7 @@ def test_every_relabelling_is_the_rdm_of_relabelled_stimuli():
 
 
 def test_squares_are_symmetric():
-    matrix = square(np.arange(1.0, 16.0))
+    matrix = to_matrices(np.arange(1.0, 16.0))
     assert (matrix == matrix.T).all()
     assert not matrix.diagonal().any()
     assert matrix[0, 5] == 5

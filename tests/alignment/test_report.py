@@ -13,7 +13,7 @@ from tactile_rt.alignment.json_file import encode, write_json
 from tactile_rt.alignment.layers import Layers
 from tactile_rt.alignment.pictures import Point, draw_profiles, draw_scatter
 from tactile_rt.alignment.report import report_page
-from tactile_rt.alignment.results import baseline_of, model_result, read_results, results_of
+from tactile_rt.alignment.results import baseline_of, read_results, results_of, score_model
 from tactile_rt.alignment.stimuli_input import read_stimuli
 from tactile_rt.alignment.strict import freeze_strict
 from tactile_rt.core.errors import ConfigError
@@ -41,7 +41,7 @@ def network(rng, name, units=30):
 def results(benchmark):
     rng = np.random.default_rng(0)
     models = [
-        model_result(benchmark, network(rng, f"model <{i}>"), network(rng, "before"), (p, "told"))
+        score_model(benchmark, network(rng, f"model <{i}>"), network(rng, "before"), (p, "told"))
         for i, p in enumerate((0.4, 0.5, 0.7))
     ]
     return results_of(benchmark, read_stimuli(), models)
@@ -63,7 +63,7 @@ def test_the_page_stands_alone_and_everything_is_on_it(results, benchmark):
 
 def test_the_verdict_is_the_gates_and_its_power_stands_beside_it(results, benchmark, tmp_path):
     rng = np.random.default_rng(0)
-    model = model_result(benchmark, network(rng, "model"))
+    model = score_model(benchmark, network(rng, "model"))
     (test,) = (c for c in neural_checks(model, benchmark) if c.name == "turing")
     assert (model.turing, model.turing_why) == (test.verdict, test.why) and "Power: " in test.why
     said = {"pass": ">passes<", "fail": ">fails<", "inconclusive": ">cannot tell<"}
@@ -77,7 +77,7 @@ def test_the_verdict_is_the_gates_and_its_power_stands_beside_it(results, benchm
 def test_a_benchmark_without_reliable_animals_says_so(benchmark):
     targets = tuple(change(t, reliable=False) for t in benchmark.targets)
     bad = change(benchmark, targets=targets)
-    model = model_result(bad, network(np.random.default_rng(0), "model"))
+    model = score_model(bad, network(np.random.default_rng(0), "model"))
     text = report_page(results_of(bad, read_stimuli(), [model]))
     assert "cannot tell" in text and "the benchmark is not valid" in text
     check_page(text)
@@ -144,7 +144,7 @@ def test_layers_that_take_no_part_are_told_with_the_stimuli_that_they_are_silent
     for name in ("encoder.0", "encoder.2"):
         traces[name][2] = 0
     layers = Layers("m", traces, dict.fromkeys(traces, 0), np.zeros((6, 1, 2), np.float32), 1)
-    result = model_result(benchmark, layers)
+    result = score_model(benchmark, layers)
     assert np.isnan(result.rdms).all(axis=1).tolist() == [False, False, False, True]
     assert np.isnan(result.rdms).any(axis=1).tolist() == [True, False, True, True]
     why = "layers have no RDM and take no part, for all units of each answer"
@@ -205,6 +205,6 @@ def test_the_groups_are_what_the_file_says(benchmark):
         network={"encoder": "gru", "attender": "none", "width": 1.0},
         training={"objective": "simclr", "augmentation": "tactile", "masking": 0.75, "seed": 1},
     )
-    made = model_result(benchmark, layers)
+    made = score_model(benchmark, layers)
     assert made.groups == GROUPS | {"objective": "simclr", "masking": "0.75"}
-    assert model_result(benchmark, network(np.random.default_rng(2), "m")).groups == {}
+    assert score_model(benchmark, network(np.random.default_rng(2), "m")).groups == {}

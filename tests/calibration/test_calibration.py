@@ -18,7 +18,7 @@ from tactile_rt.calibration import (
     calibrate,
     calibration_path,
     load_calibration,
-    raw_readings,
+    median_readings,
     read_loads,
     save_calibration,
     tare,
@@ -701,12 +701,12 @@ def test_a_table_of_times_takes_medians_of_valid_samples(tmp_path) -> None:
     values[100:130] = np.nan
     (whole,) = cut_chunks(values, 1000.0, samples=250, start_ns=10**15)
     recorded = replace(whole, valid=valid)
-    assert raw_readings(table, recorded, small_spec(2), "A1").tolist() == [[1, 2], [3, 4]]
+    assert median_readings(table, recorded, small_spec(2), "A1").tolist() == [[1, 2], [3, 4]]
     with pytest.raises(ConfigError, match="no element 'B1'; there are A0, A1"):
-        raw_readings(table, recorded, small_spec(2), "B1")
+        median_readings(table, recorded, small_spec(2), "B1")
     valid[100:200] = False
     with pytest.raises(ConfigError, match=r"line 3: no valid sample of A0 from 0.1 to 0.2 s; the"):
-        raw_readings(table, recorded, small_spec(2), "A0")
+        median_readings(table, recorded, small_spec(2), "A0")
 
 
 @pytest.mark.parametrize(

@@ -157,7 +157,7 @@ def test_a_git_lfs_pointer_is_refused_by_that_name(refused, tmp_path, name):
 
 def test_a_git_lfs_pointer_is_refused_behind_every_other_door(tmp_path):
     from tactile_rt.alignment.json_file import read_json
-    from tactile_rt.alignment.loading import responses_layers
+    from tactile_rt.alignment.loading import read_responses
     from tactile_rt.alignment.neural import read_published
     from tactile_rt.alignment.stimuli_input import read_stimuli
     from tactile_rt.core.errors import TactileError
@@ -166,7 +166,7 @@ def test_a_git_lfs_pointer_is_refused_behind_every_other_door(tmp_path):
     path = tmp_path / "a.npz"
     path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n")
     doors = [
-        responses_layers, read_published, read_stimuli, check_appendable,
+        read_responses, read_published, read_stimuli, check_appendable,
         lambda path: read_json(path, dict, ""), lambda path: read_labels(path, []),
     ]  # fmt: skip
     for door in doors:

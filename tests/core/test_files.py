@@ -7,7 +7,7 @@ import subprocess
 
 import pytest
 
-from tactile_rt.core.files import replace_file, whole_folder, write_whole
+from tactile_rt.core.files import replace_file, replace_folder, write_whole
 
 
 @pytest.fixture
@@ -22,7 +22,7 @@ def umask():
 def test_what_is_written_is_as_private_as_its_user_wants(umask, tmp_path, mask, file, folder):
     umask(mask)
     write_whole(tmp_path / "a.json", lambda out: out.write(b"{}"))
-    with whole_folder(tmp_path / "bag") as made:
+    with replace_folder(tmp_path / "bag") as made:
         (made / "b").write_bytes(b"")
     assert stat.S_IMODE((tmp_path / "a.json").stat().st_mode) == file
     assert stat.S_IMODE((tmp_path / "bag").stat().st_mode) == folder
@@ -48,13 +48,13 @@ def test_where_nothing_can_be_made_the_name_is_the_one_that_was_given(tmp_path):
     with pytest.raises(FileNotFoundError) as failed:
         write_whole(path, lambda out: None)
     assert failed.value.filename == str(path)
-    with pytest.raises(FileNotFoundError) as failed, whole_folder(path):
+    with pytest.raises(FileNotFoundError) as failed, replace_folder(path):
         pass
     assert failed.value.filename == str(path)
 
 
 def test_a_failure_in_a_hidden_folder_names_what_it_was_to_be(tmp_path):
-    with pytest.raises(FileNotFoundError) as failed, whole_folder(tmp_path / "bag") as made:
+    with pytest.raises(FileNotFoundError) as failed, replace_folder(tmp_path / "bag") as made:
         (made / "none" / "a").write_bytes(b"")
     assert failed.value.filename == str(tmp_path / "bag")
     assert os.listdir(tmp_path) == []
@@ -64,11 +64,11 @@ def test_a_folder_is_replaced_whole_or_stays(tmp_path):
     path = tmp_path / "bag"
     path.mkdir()
     (path / "old").write_bytes(b"")
-    with pytest.raises(ZeroDivisionError), whole_folder(path) as made:
+    with pytest.raises(ZeroDivisionError), replace_folder(path) as made:
         (made / "new").write_bytes(b"")
         raise ZeroDivisionError
     assert os.listdir(path) == ["old"]
-    with whole_folder(path) as made:
+    with replace_folder(path) as made:
         (made / "new").write_bytes(b"")
     assert os.listdir(path) == ["new"] and os.listdir(tmp_path) == ["bag"]
 
@@ -104,6 +104,6 @@ def test_what_cannot_be_written_is_named_by_its_own_name(read_only):
         write_whole(path, lambda file: file.write(b"x"))
     with pytest.raises(OSError) as slow, replace_file(path):
         pass
-    with pytest.raises(OSError) as folder, whole_folder(path):
+    with pytest.raises(OSError) as folder, replace_folder(path):
         pass
     assert {e.value.filename for e in (whole, slow, folder)} == {str(path)}

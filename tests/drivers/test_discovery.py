@@ -6,7 +6,14 @@ from types import SimpleNamespace
 
 import pytest
 
-from tactile_rt.drivers.discovery import CanBus, Port, can_buses, diagnose, serial_ports, udev_rules
+from tactile_rt.drivers.discovery import (
+    CanBus,
+    Port,
+    diagnose,
+    list_can_buses,
+    serial_ports,
+    udev_rules,
+)
 
 
 @pytest.fixture
@@ -21,11 +28,11 @@ def net(tmp_path):
 
 
 def test_can_interfaces_are_found_by_their_type(net):
-    up, down = can_buses(net)
+    up, down = list_can_buses(net)
     assert (up.name, up.up, up.bitrate) == ("can0", True, 500_000)
     assert (down.name, down.up) == ("can1", False)
     assert up.url == "can:socketcan:can0?codec="
-    assert can_buses(net / "nothing") == []
+    assert list_can_buses(net / "nothing") == []
 
 
 def test_ports_are_known_by_their_numbers(monkeypatch, tmp_path):

@@ -11,7 +11,7 @@ from tactile_rt.core.errors import ConfigError
 from tactile_rt.core.stream import MOUSE
 from tactile_rt.models.datasets import SweepSet, drawn_as, join_sets, windows
 from tactile_rt.models.evaluation.measures import cut_windows
-from tactile_rt.models.training.batches import TrainingBatches, partners
+from tactile_rt.models.training.batches import TrainingBatches, draw_partners
 from tactile_rt.sets.manifest import SweepManifest
 from tactile_rt.sets.objects import Sweeps
 from tests.helpers.tiny_sweeps import plate
@@ -85,7 +85,7 @@ def test_two_views_of_an_epoch_share_the_sweeps_and_nothing_that_is_drawn() -> N
 @given(st.lists(st.integers(0, 5), min_size=1, max_size=30), st.integers(0, 2**32 - 1))
 def test_partners_are_others_of_the_same_object(objects: list[int], seed: int) -> None:
     names = np.array([f"mug-{i}" for i in objects])
-    found = partners(names, np.random.default_rng(seed))
+    found = draw_partners(names, np.random.default_rng(seed))
     assert sorted(found) == list(range(len(names)))  # each is the partner of one
     assert (names[found] == names).all()
     for i, name in enumerate(names):
@@ -93,7 +93,7 @@ def test_partners_are_others_of_the_same_object(objects: list[int], seed: int) -
 
 
 def test_all_others_of_an_object_are_as_likely_as_partners() -> None:
-    drawn = [partners(np.array(["a"] * 4), np.random.default_rng(i))[0] for i in range(3000)]
+    drawn = [draw_partners(np.array(["a"] * 4), np.random.default_rng(i))[0] for i in range(3000)]
     assert np.allclose(np.bincount(drawn, minlength=4) / 3000, [0, 1 / 3, 1 / 3, 1 / 3], atol=0.04)
 
 

@@ -353,16 +353,16 @@ def test_a_cell_begins_with_another_and_learns_from_fewer_objects(plan: Path) ->
     name = "gru after simclr image of 0.5"
     assert [task.name for task in grid.tasks()].count(name) == 1, "one seed"
     (task,) = [task for task in grid.tasks() if task.name == name]
-    assert grid.needs(task) == ("gru_simclr_image_seed0",)
+    assert grid.list_dependencies(task) == ("gru_simclr_image_seed0",)
     other = msgspec.structs.replace(grid, self_supervised={"masking": 0.5})
     assert settings_of(other, task) != settings_of(grid, task)
     bench = begun(plan, folder)
-    few = bench.splits_of(0.5)[0]
+    few = bench.splits_with_share(0.5)[0]
     assert set(few.sweeps.objects) == {"mug-0", "mug-1", "car-0", "car-1"}
-    assert bench.splits_of(1.0)[0] is bench.splits[0]
+    assert bench.splits_with_share(1.0)[0] is bench.splits[0]
     said = "'gru simclr image' diverged, and there is nothing to begin with"
     assert bench.do(task).failed == said
-    (before,) = [t for t in grid.tasks() if t.slug in grid.needs(task)]
+    (before,) = [t for t in grid.tasks() if t.slug in grid.list_dependencies(task)]
     assert not bench.do(before).failed
     shutil.rmtree(folder / "runs" / before.slug)  # its outcome was kept, its network was not
     done = bench.do(task)

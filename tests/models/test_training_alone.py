@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from tactile_rt.core.errors import ConfigError, ModelError
-from tactile_rt.models.checkpoints import describe_checkpoint, load_checkpoint, network_of
+from tactile_rt.models.checkpoints import describe_checkpoint, load_checkpoint, read_network_options
 from tactile_rt.models.ead_config import CELLS
 from tactile_rt.models.encoders import cells
 from tactile_rt.models.grid.plan import read_grid
@@ -186,7 +186,7 @@ def test_a_checkpoint_is_described_as_torch_reads_it(trained):
 
     saved = torch.load(trained / "best.pt", weights_only=True)
     assert describe_checkpoint(trained / "best.pt") == plain(saved)
-    assert network_of(trained / "best.pt")["encoder"] == "gru"
+    assert read_network_options(trained / "best.pt")["encoder"] == "gru"
     assert saved["period_ns"] == 9_000_000  # of which the array of weights says nothing
 
 
@@ -220,7 +220,7 @@ def test_what_is_no_checkpoint_is_refused_by_one_wording(trained, tmp_path):
     os.mkfifo(tmp_path / "pipe")
     for path in sorted(tmp_path.iterdir()):
         wordings = set()
-        for read in (describe_checkpoint, network_of, load_checkpoint):
+        for read in (describe_checkpoint, read_network_options, load_checkpoint):
             with pytest.raises(ModelError) as refusal:
                 read(path)
             wordings.add(str(refusal.value))

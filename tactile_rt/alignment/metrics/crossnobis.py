@@ -16,7 +16,7 @@ from tactile_rt.alignment.metrics import Measure
 from tactile_rt.alignment.metrics.noise_ceiling import ceiling_of, divisions, sessions_of
 from tactile_rt.alignment.metrics.rsa_cka import NOTHING, mean_pattern
 from tactile_rt.alignment.neural import Animal, NeuralSession
-from tactile_rt.alignment.rdm import Floats, pearson, upper
+from tactile_rt.alignment.rdm import Floats, pearson, upper_indices
 
 
 def crossnobis(animal: Animal) -> Measure:
@@ -25,7 +25,7 @@ def crossnobis(animal: Animal) -> Measure:
     if not sessions:
         return NOTHING
     units = sum(s.rates.shape[1] for s in sessions)
-    pairs = len(upper(len(sessions[0].stimuli))[0])
+    pairs = len(upper_indices(len(sessions[0].stimuli))[0])
     whole, halves = np.zeros(pairs), np.zeros((2, 1, pairs))
     for session in sessions:
         white = session.rates @ _compute_whitening(session)
@@ -58,7 +58,7 @@ def distances(white: Floats, stimulus: NDArray[np.int64], chosen: NDArray[np.boo
     own = ((total**2).sum(axis=-1) - alone) / (number * (number - 1))
     mean = total / number[..., None]
     between = np.matmul(mean, mean.swapaxes(-1, -2))
-    i, j = upper(len(of_each))
+    i, j = upper_indices(len(of_each))
     return np.asarray(own[:, i] + own[:, j] - 2 * between[:, i, j])
 
 
@@ -98,5 +98,5 @@ def _compute_whitening(session: NeuralSession) -> Floats:
 
 def _measure_distances(patterns: Floats) -> Floats:
     """Compute squared Euclidean distances (pair,) of responses (stimulus, unit)."""
-    i, j = upper(len(patterns))
+    i, j = upper_indices(len(patterns))
     return np.asarray(((patterns[i] - patterns[j]) ** 2).sum(axis=-1))

@@ -18,7 +18,7 @@ import numpy as np
 
 from tactile_rt.alignment.metrics import Measure, noise_ceiling
 from tactile_rt.alignment.neural import Animal
-from tactile_rt.alignment.rdm import Floats, pearson, rdm, upper
+from tactile_rt.alignment.rdm import Floats, pearson, rdm, upper_indices
 
 NOTHING = Measure(float("nan"), lambda layer: float("nan"))  # for too few trials or units
 
@@ -91,7 +91,7 @@ def u_centred(patterns: Floats) -> Floats:
     """
     kernel = np.matmul(patterns, np.swapaxes(patterns, -1, -2))
     n = kernel.shape[-1]
-    i, j = upper(n)
+    i, j = upper_indices(n)
     kernel = kernel * (1 - np.eye(n))
     rows = kernel.sum(axis=-1)
     centred = (

@@ -110,12 +110,12 @@ def kernels(blocks: Sequence[S4Block], steps: int) -> Tensor:
     e = 2 * r - (1 - part)
     # Woodbury: (I - Δ/2 A)^-1 z = r z - v (w · z). A conjugate pair adds twice a real part, so
     # w · z is a sum over real numbers.
-    w = 2 * conjugate * product(r, p * conjugate)
+    w = 2 * conjugate * multiply_complex(r, p * conjugate)
     pdp = 2 * ((p**2).sum(1) * r[:, 0]).sum(-1)[:, None, None]
     half = dt[:, :, None] / 2
-    v = product(r, p) * half / (1 + half * pdp)
+    v = multiply_complex(r, p) * half / (1 + half * pdp)
     b = b * dt[:, :, None]
-    x = product(r, b) - v * (w * b).sum((1, 2), keepdim=True)
+    x = multiply_complex(r, b) - v * (w * b).sum((1, 2), keepdim=True)
     # Ā x = e x - 2 v (w · x)
     e_re, e_im, v, states = e[:, :1], -conjugate * e[:, 1:], 2 * v, [x]
     for _ in range(steps - 1):
@@ -224,7 +224,7 @@ class FoldedS4(nn.Module):
         return self.encoder.filter(frame, self.kernels, state)
 
 
-def product(a: Tensor, b: Tensor) -> Tensor:
+def multiply_complex(a: Tensor, b: Tensor) -> Tensor:
     """Multiply complex arrays that are stored as (..., 2, state): real and imaginary parts."""
     (a_re, a_im), (b_re, b_im) = a.unbind(-2), b.unbind(-2)
     return torch.stack([a_re * b_re - a_im * b_im, a_re * b_im + a_im * b_re], -2)

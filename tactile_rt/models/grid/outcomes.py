@@ -89,7 +89,7 @@ class Outcome(msgspec.Struct, frozen=True):
         return np.asarray(np.array(list(getattr(self, which)), dtype=np.str_) == "1")
 
 
-def saw_nothing(trials: Sequence[Training], chance: float) -> bool:
+def shows_nothing(trials: Sequence[Training], chance: float) -> bool:
     """Return whether trials' scores are all near chance or equal, so rank no learning rates."""
     scores = [trial.score for trial in trials if not trial.diverged]
     if not scores:

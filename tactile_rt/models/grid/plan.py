@@ -225,7 +225,7 @@ class Grid(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         (cell,) = (one for one in self.cells if one.name == task.cell.begin)
         return Task(cell.name, task.seed, cell)
 
-    def needs(self, task: Task) -> tuple[str, ...]:
+    def list_dependencies(self, task: Task) -> tuple[str, ...]:
         """Return the slugs of a task's dependencies: the tuning seed and the initial weights."""
         cell = task.cell
         if cell is None or task.random:

@@ -65,7 +65,7 @@ def _run_locked(grid: Grid, folder: Path, processes: int, report: Report, accele
     def ready() -> Task | None:
         """Remove and return the next waiting task whose dependencies are finished."""
         for task in waiting:
-            if finished.issuperset(grid.needs(task)):
+            if finished.issuperset(grid.list_dependencies(task)):
                 waiting.remove(task)
                 return task
         return None

@@ -15,7 +15,7 @@ from tactile_rt.models.grid.outcomes import (
     Training,
     read_outcome,
     read_tested,
-    saw_nothing,
+    shows_nothing,
 )
 from tactile_rt.models.grid.plan import RANDOM, SVM, Candidate, Grid
 
@@ -139,7 +139,7 @@ def _make_row(
         len(scores) > 1 and scores[-1] < scores[-2] + grid.growth.gain,
         "; ".join(sorted({one.failed for one in outcomes if one.failed})),
         estimate(outcomes, "known"),
-        not (first.trials and saw_nothing(first.trials, 1 / tested.classes)),
+        not (first.trials and shows_nothing(first.trials, 1 / tested.classes)),
     )
 
 

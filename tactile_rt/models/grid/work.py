@@ -72,7 +72,7 @@ class Workbench:
             config = self.grid.config(task, self.data)
             build(config.augmentation, manifest.spec)
             config.network(len(manifest.categories), manifest.frame)
-            sweeps = self.splits_of(task.cell.share)[0].sweeps
+            sweeps = self.splits_with_share(task.cell.share)[0].sweeps
             pairs, length = config.pairs == TWO_SWEEPS, sweeps.values.shape[1]
             check_batches(sweeps.objects, length, config.batch, config.jitter, pairs)
         with launch_devices(config, self.accelerator):
@@ -140,12 +140,12 @@ class Workbench:
         for longer in LONGER:
             updates = longer * search.updates
             rates = [of(rate, search.warmup[0], updates) for rate in search.learning_rate]
-            if not outcomes.saw_nothing(rates, chance):
+            if not outcomes.shows_nothing(rates, chance):
                 break
         for _ in range(FURTHER if len(rates) > 1 else 0):
             rates.sort(key=lambda one: one.learning_rate)
             best, place = max(rates, key=_score), [one.learning_rate for one in rates]
-            if outcomes.saw_nothing(rates, chance) or best not in (rates[0], rates[-1]):
+            if outcomes.shows_nothing(rates, chance) or best not in (rates[0], rates[-1]):
                 break
             at, step = (0, place[0] / place[1]) if best is rates[0] else (-1, place[-1] / place[-2])
             rates.append(of(place[at] * step, search.warmup[0], updates))
@@ -189,7 +189,7 @@ class Workbench:
             self._train(self.grid.find_beginning(task), begun.chosen, report)
         timed = self.accelerator == "cpu" and not (run / "last.pt").exists()
         began = time.process_time()
-        splits, diverged = self.splits_of(cell.share), False
+        splits, diverged = self.splits_with_share(cell.share), False
         try:
             best = train(config, run, report, device=self.accelerator, splits=splits)
             seconds = time.process_time() - began
@@ -232,7 +232,7 @@ class Workbench:
         best = probe(best, run / "probe", ProbeConfig(**self.grid.probe), splits=self.splits)
         return self._score_test(found, best, config)
 
-    def splits_of(self, share: float) -> tuple[SweepSet, SweepSet]:
+    def splits_with_share(self, share: float) -> tuple[SweepSet, SweepSet]:
         """Return training and validation splits, with only a share of the training objects."""
         if share == 1:
             return self.splits

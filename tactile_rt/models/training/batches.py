@@ -30,7 +30,7 @@ AUGMENTED = 1  # in the seed of the augmentation of frames, so that it differs f
 JITTER = 5  # samples by which a window may begin earlier or later, by default
 
 
-def partners(objects: NDArray[Any], rng: np.random.Generator) -> NDArray[np.int64]:
+def draw_partners(objects: NDArray[Any], rng: np.random.Generator) -> NDArray[np.int64]:
     """Draw for each sweep another sweep of the same object; itself if the only one.
 
     objects (n,), the object of each sweep -> (n,) indices into `objects`
@@ -156,7 +156,7 @@ class TrainingBatches:
         if view:
             rng = np.random.default_rng([self._seed, number, view])
             if self._two_sweeps:
-                order = order[partners(self._data.sweeps.objects[order], rng)]
+                order = order[draw_partners(self._data.sweeps.objects[order], rng)]
         severity = min(1.0, number / self.easy_epochs) if self.easy_epochs else 1.0
         for i in range(len(self)):
             yield self._draw(order[i * self._batch : (i + 1) * self._batch], rng, severity)

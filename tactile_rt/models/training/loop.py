@@ -33,8 +33,8 @@ from tactile_rt.models.training.batches import (
     BatchFeed,
     Share,
     TrainingBatches,
+    draw_partners,
     generator_of,
-    partners,
 )
 from tactile_rt.models.training.config import (
     TWO_SWEEPS,
@@ -283,7 +283,7 @@ class Validation:
             self._other = np.arange(len(data.sweeps))  # the sweep of the second view
             if config.pairs == TWO_SWEEPS:
                 rng = np.random.default_rng([config.seed, VIEWS])
-                self._other[usable] = usable[partners(data.sweeps.objects[usable], rng)]
+                self._other[usable] = usable[draw_partners(data.sweeps.objects[usable], rng)]
 
     def __call__(self, objective: Objective) -> Score:
         """Return metrics by name and a score to maximise; NaN if outputs are not finite."""

@@ -15,7 +15,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, BinaryIO, Final
 
 from tactile_rt.core.errors import RecordingError, describe_error
-from tactile_rt.core.files import check_no_pointer, open_regular
+from tactile_rt.core.files import open_regular, refuse_lfs_pointer
 from tactile_rt.core.packages import require_extra
 from tactile_rt.recording.records import MAGIC
 
@@ -94,7 +94,7 @@ def open_bag(path: Path) -> Iterator[OpenBag]:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     for file in path.iterdir() if path.is_dir() else ():
-        check_no_pointer(file)
+        refuse_lfs_pointer(file)
     with ExitStack() as stack:
         notes: list[str] = []
         store = get_typestore(Stores.LATEST)

@@ -95,7 +95,7 @@ class ArrayFinding:
         return self.what, self.unit, described, measured, ratio
 
 
-def about(value: float, error: float) -> Figure:
+def make_estimate(value: float, error: float) -> Figure:
     """Make a `Figure` from a value and the relative half width of its interval."""
     return Figure(value, value / (1 + error), value * (1 + error))
 
@@ -117,7 +117,7 @@ def pool_figures(figures: Sequence[Figure], apart: float) -> tuple[Figure, list[
     spread = TO_SIGMA * np.median(np.abs(logs[alike] - centre))
     each = max(math.sqrt(np.mean(errors[alike] ** 2)), SIGMAS * spread)
     half = each * (MEDIAN if alike.sum() > 2 else 1.0) / math.sqrt(alike.sum())
-    return about(float(np.exp(centre)), math.expm1(half)), np.flatnonzero(~alike).tolist()
+    return make_estimate(float(np.exp(centre)), math.expm1(half)), np.flatnonzero(~alike).tolist()
 
 
 def spread_of(values: Sequence[float], known: float) -> Figure:
@@ -156,7 +156,7 @@ def compare_sensor(
     Args:
         untouched: for each whisker, the (channel,) readings at rest that the description predicts.
     """
-    edits = change(("sensor", "rate_hz"), sensor.rate_hz, about(rate.value, SAME_RATE))
+    edits = change(("sensor", "rate_hz"), sensor.rate_hz, make_estimate(rate.value, SAME_RATE))
     note = ""
     if edits and rate.low > FASTEST_HZ:
         edits, note = (), f"left: the simulation samples at {FASTEST_HZ:g} Hz at most"
@@ -197,7 +197,7 @@ class _ChannelAtRest:
             white = math.sqrt(max(rest.noise[c] ** 2 - left, 0.1 * rest.noise[c] ** 2))
             counted = len(rest.levels) * (rest.size - 2)
             error = SIGMAS * MEDIAN / math.sqrt(2 * counted) * (rest.noise[c] / white) ** 2
-            figures.append(about(white / math.sqrt(passed_hz), error))
+            figures.append(make_estimate(white / math.sqrt(passed_hz), error))
         figure, strange = pool_figures(figures, NOISIER)
         unlike = [self._fine[k] for k in strange]
         notes = [f"unlike most: {name_some(unlike, MANY)}"] if unlike else []

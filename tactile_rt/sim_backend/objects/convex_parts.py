@@ -26,7 +26,13 @@ import trimesh
 from manifold3d import Manifold, OpType
 from scipy.spatial import ConvexHull, QhullError
 
-from tactile_rt.sim_backend.objects.deviation import FACES, TILE, spread_planes, surface_of, tiles
+from tactile_rt.sim_backend.objects.deviation import (
+    FACES,
+    TILE,
+    interleave_directions,
+    surface_of,
+    tiles,
+)
 from tactile_rt.sim_backend.objects.polygons import Floats, flat
 
 P = TypeVar("P")
@@ -257,7 +263,7 @@ class SolidPieces:
         points = self._surface[first:last]
         y, z = points[:, 1], points[:, 2]
         points = points[(y > low[1]) & (y < high[1]) & (z > low[2]) & (z < high[2])]
-        planes = spread_planes(hull.equations)
+        planes = interleave_directions(hull.equations)
         for k in range(0, len(planes), FACES):  # few points remain after some planes
             some = planes[k : k + FACES]
             depth = -(points @ some[:, :3].T + some[:, 3]).max(axis=1, initial=-np.inf)

@@ -150,7 +150,7 @@ def _find_inside(points: Floats, solids: Sequence[Manifold]) -> NDArray[np.bool_
     return inside
 
 
-def spread_planes(planes: Floats) -> Floats:
+def interleave_directions(planes: Floats) -> Floats:
     """Reorder planes by the golden ratio, so that consecutive planes cover all directions."""
     ordered: Floats = planes[np.argsort(np.arange(len(planes)) * 0.6180339887 % 1)]
     return ordered

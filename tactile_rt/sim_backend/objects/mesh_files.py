@@ -23,7 +23,7 @@ import numpy as np
 import trimesh
 
 from tactile_rt.core.errors import ConfigError, explain_errors
-from tactile_rt.core.files import check_no_pointer
+from tactile_rt.core.files import refuse_lfs_pointer
 from tactile_rt.sim_backend.objects import mesh_formats
 from tactile_rt.sim_backend.objects.mesh_formats import MOST_NODES, check_number, load_meshes
 
@@ -123,7 +123,7 @@ def _read_buffers(path: Path, scene: Any) -> Iterator[bytes]:
             beside = path.parent / unquote(uri)
             if not beside.is_file():
                 raise ConfigError(f"{path}: {uri}, which it names, is not beside it; copy both")
-            check_no_pointer(beside)
+            refuse_lfs_pointer(beside)
             if beside.stat().st_size < buffer["byteLength"]:
                 raise ConfigError(f"{path}: {uri}, which it names, is cut short; copy it again")
             yield beside.read_bytes()
@@ -199,7 +199,7 @@ def check_mesh_file(path: Path) -> None:
         raise ConfigError(f"{path}: no such file")
     if path.stat().st_size == 0:
         raise ConfigError(f"{path}: the file is empty; export it again")
-    check_no_pointer(path)
+    refuse_lfs_pointer(path)
 
 
 def mesh_content(path: Path) -> bytes:

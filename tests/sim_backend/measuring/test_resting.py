@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from tactile_rt.sim_backend.measuring.findings import about, pool_figures, spread_of
+from tactile_rt.sim_backend.measuring.findings import make_estimate, pool_figures, spread_of
 from tactile_rt.sim_backend.measuring.resting import drift_likelihood, find_rest, rounding_step
 
 FORGETS_S = 60.0
@@ -126,8 +126,8 @@ def test_an_interval_of_several_holds_the_truth_and_names_who_is_not_alike() -> 
     rng = np.random.default_rng(0)
     inside = 0
     for _ in range(200):
-        figures = [about(3.0 * np.exp(0.05 * z), 0.098) for z in rng.standard_normal(7)]
-        figure, strange = pool_figures([*figures, about(6.0, 0.1)], 1.3)
+        figures = [make_estimate(3.0 * np.exp(0.05 * z), 0.098) for z in rng.standard_normal(7)]
+        figure, strange = pool_figures([*figures, make_estimate(6.0, 0.1)], 1.3)
         assert strange == [7]
         inside += figure.low <= 3.0 <= figure.high
     assert inside > 180
