@@ -67,7 +67,10 @@ def model_result(
     untrained: Layers | None = None,
     performance: tuple[float, str] | None = None,
 ) -> ModelResult:
-    """Score a model and its untrained network; under strict, run the Turing test too."""
+    """Score a model and its untrained network.
+
+    Protocol strict adds the test against real animals ("Turing test").
+    """
     patterns = layers.patterns
     made = score(benchmark, patterns)
     # The test needs the stimuli's names, which paper-code does not have.

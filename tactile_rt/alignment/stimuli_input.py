@@ -86,7 +86,7 @@ class StimuliInput:
 
 
 def read_stimuli(path: Path | None = None) -> StimuliInput:
-    """Read a file of `tactile-rt whisk`; without a path, this package's input."""
+    """Read the stimuli's loads that `tactile-rt whisk` wrote; without a path, the shipped file."""
     path = SHIPPED if path is None else path
     check_no_pointer(path)
     try:

@@ -262,7 +262,7 @@ def _main() -> int:
 
 
 def _rewrite_error(text: str, task: _Task) -> str:
-    """Shorten an error text, or explain the limit if onnxruntime lacked memory."""
+    """Shorten a failed trial's error; if memory ran out, name the memory limit instead."""
     if any(word in text for word in WANTED_MEMORY):
         return f"{task.path} is refused: {_explain_memory(task.limits)}"
     return text[:MESSAGE]

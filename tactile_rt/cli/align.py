@@ -67,7 +67,8 @@ def build_benchmark(
     ] = None,
     cells: Annotated[str | None, option("Only excitatory or inhibitory units.")] = None,
     clock: Annotated[
-        str | None, option("Clock of the spike times: session or recording (see the docs).")
+        str | None,
+        option("Zero of the spike times: session (as in NWB) or recording (as published)."),
     ] = None,
     bootstraps: Annotated[int, option("Number of random splits of the trials.")] = 1000,
     seed: Seed = 1234,

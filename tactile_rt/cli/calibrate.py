@@ -23,16 +23,15 @@ if TYPE_CHECKING:
 
 LOUDER = 3.0  # times the noise of the last tare: more prints a warning
 
-Out = Annotated[Path | None, option("TOML file to write or update. Default: the device's own.")]
-Device = Annotated[str, option("Id of the device. Default: the id that it reports.")]
-
 
 @app.command(epilog="tactile-rt tare 'serial:///dev/ttyUSB0?codec=bota'")
 def tare(
     source: Url,
     seconds: Annotated[float, option("How long to read, s.", min=0.01, max=3600)] = 2.0,
-    device: Device = "",
-    out: Out = None,
+    device: Annotated[str, option("Id of the device. Default: the id that it reports.")] = "",
+    out: Annotated[
+        Path | None, option("TOML file to write or update. Default: the device's own.")
+    ] = None,
     json: Json = None,
 ) -> None:
     """Measure the zero of an untouched sensor and store it.
@@ -88,8 +87,10 @@ def calibrate(
     table: Annotated[Path, argument("CSV file: loads fx..mz, and raw_... or start_s,end_s.")],
     element: Annotated[str, option("Element that was loaded. Default: the only one.")] = "",
     source: Annotated[str, option("URL of the recording that start_s and end_s refer to.")] = "",
-    device: Device = "",
-    out: Out = None,
+    device: Annotated[str, option("Id of the device whose file to update.")] = "",
+    out: Annotated[
+        Path | None, option("TOML file to write or update. Default: the file of --device.")
+    ] = None,
     json: Json = None,
 ) -> None:
     """Fit an element's calibration matrix to known loads.

@@ -174,7 +174,7 @@ def hil(
     sets: Annotated[list[str] | None, set_option("An option of the codec: format=int16")] = None,
     faults: Faults = None,
     sweeps: Annotated[
-        int | None, option(f"Objects that pass, with sim:. Default: {SWEEPS}.", min=1)
+        int | None, option(f"Objects to sweep past, for a sim: source. Default: {SWEEPS}.", min=1)
     ] = None,
     seconds: Annotated[
         float | None, option("Stop after this many seconds of the stream.", min=0.001, max=1e9)

@@ -39,7 +39,9 @@ def import_file(
     topic: Annotated[str, option("Topic to read from a bag.")] = "",
     rate: Annotated[float, option("Samples per second, if the log has no times.", min=0)] = 0,
     bus: Annotated[str, option("Bus to read from a log of several, e.g. can0.")] = "",
-    form: Annotated[str, option("Format of the log, if it is detected wrongly.")] = "",
+    form: Annotated[
+        str, option("Format, if detected wrongly: raw, hex, terminal, candump, asc, blf, ...")
+    ] = "",
     delimiter: Annotated[str, option("Column delimiter: character, tab or space.")] = "",
     decimal: Annotated[str, option("Decimal mark of a table: a comma or a point.")] = "",
     skip: Annotated[int, option("Lines of a table to skip.", min=0)] = 0,

@@ -164,7 +164,7 @@ def _format_pairs(values: dict[str, Any]) -> str:
 @app.command("eval", epilog="tactile-rt eval model.onnx sweeps --pictures pictures")
 def evaluate(
     model: File,
-    data: Annotated[Path, argument("A sweep set.")],
+    data: Annotated[Path, argument("Sweep set; its test objects are used.")],
     svm: Annotated[bool, option("Also fit an RBF SVM on the same windows.", "--svm")] = False,
     pictures: Annotated[
         Path | None, option("Folder for pictures of confusion and accuracy over time.")

@@ -121,7 +121,8 @@ def whisk(
         str | None, option("Stimuli: convex-close, ..., comma-separated. Default: all six.")
     ] = None,
     target: Annotated[
-        str | None, option("Object, not a stimulus: mug-3, or a mesh file.", "--object")
+        str | None,
+        option("Whisk against this object, not the stimuli: mug-3, or a mesh file.", "--object"),
     ] = None,
     array: Array = "mouse",
     trajectory: Annotated[

@@ -90,7 +90,7 @@ def release(
 
 
 def run_file(path: Path) -> Step:
-    """Load a model file, step or window, as a function for `evaluation.measures.predict`."""
+    """Load a step or window model; return a function from samples to logits, for `predict`."""
     session, card = load_model(path, kind=None)
 
     def run(samples: Floats, offset: Floats, sigma: Floats) -> Floats:

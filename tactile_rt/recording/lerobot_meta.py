@@ -83,7 +83,7 @@ def film_of(text: str) -> CameraFilm:
 
 
 def write_film(film: CameraFilm, folder: Path, rows: int, fps: int) -> dict[str, NDArray[Any]]:
-    """Write a video of the newest frame at each row's time, or else the first.
+    """Write one frame per dataset row: the newest by then, or else the film's first.
 
     Returns:
         The statistics of colours, from 0 to 1, of regularly sampled frames, by LeRobot's names.

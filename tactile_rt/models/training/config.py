@@ -202,7 +202,7 @@ class TrainingConfig:
     def network(
         self, classes: int, frame: tuple[int, int, int] = MOUSE_FRAME, names: int = 0
     ) -> EADConfig:
-        """Return the configuration of a network with given numbers of classes and names.
+        """Return the network's configuration for given numbers of classes and of kinds (`names`).
 
         Raises:
             ConfigError: the network is invalid.

@@ -261,7 +261,7 @@ class _DecodedLog:
 def _cut_last(
     packets: Iterator[tuple[Any, int | None]], lead: bytes
 ) -> Iterator[tuple[Any, int | None]]:
-    """Yield packets, with `lead` before the first, and the last cut into single bytes."""
+    """Yield packets, `lead` before the first; cut the last `LAST` into single bytes."""
     last: deque[tuple[Any, int | None]] = deque()
     for packet, t_ns in packets:
         last.append((lead + packet if lead else packet, t_ns))

@@ -264,7 +264,7 @@ class SweepChoice:
         return len(self.combinations()) * (self.draws + self.held_out_draws)
 
     def draw_index(self, index: int) -> int:
-        """Return the position, from 0, of sweep `index` within its combination."""
+        """Return which draw, from 0, sweep `index` is of its combination of listed values."""
         return index % (self.draws + self.held_out_draws)
 
     def draw(self, rng: np.random.Generator, index: int, shared: np.random.Generator) -> Sweep:
