@@ -151,7 +151,7 @@ def _make_sessions(
             )
         )  # fmt: skip
     if not made:
-        raise ConfigError(f"{path}: no session is of {selection}")
+        raise ConfigError(f"{path}: no session matches: {selection}")
     return made
 
 

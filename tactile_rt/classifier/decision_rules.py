@@ -267,8 +267,9 @@ class Deadline:
         if self.policy == "report" and not self._reported:
             self._reported = True
             log.warning(
-                "late: a step took %.1f ms, %.1f ms of work have gathered, its newest sample is "
-                "%.1f ms old (limit %.1f ms); %d late steps so far",
-                1e3 * took_s, 1e3 * self.behind_s, 1e3 * age, 1e3 * self.limit_s, self.late,
+                "late: step took %.1f ms, backlog %.1f ms%s (limit %.1f ms); %d late steps so far",
+                1e3 * took_s, 1e3 * self.behind_s,
+                "" if self._age is None else f", newest sample {1e3 * age:.1f} ms old",
+                1e3 * self.limit_s, self.late,
             )  # fmt: skip
         return True

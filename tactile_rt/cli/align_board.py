@@ -59,7 +59,7 @@ def fetch_recordings(
     selection = Selection(sessions=tuple(sessions or ()))
     files = [file for file in every if selection.takes(file.name)]
     if not files:
-        raise ConfigError(f"no session of {len(every)} is of {selection}: --list names them")
+        raise ConfigError(f"none of {len(every)} sessions matches {selection}: --list names them")
     if listed:
         if not told_as_json(files, json):
             for file in files:

@@ -200,7 +200,7 @@ def check_new(file: Path, force: bool) -> None:
     if not file.exists():
         return
     if not force:
-        raise ConfigError(f"{file} is there already: name another file, or give --force")
+        raise ConfigError(f"{file} already exists: name another file, or give --force")
     check_named_once(file)
     from tactile_rt.recording.writer import check_not_recorded
 

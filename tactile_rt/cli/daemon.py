@@ -224,7 +224,7 @@ def ros2_messages(
     if not folder.is_dir():
         raise ConfigError(f"no folder {folder}")
     if made.exists():
-        raise ConfigError(f"{made} is there already")
+        raise ConfigError(f"{made} already exists")
     with whole_folder(made) as unfinished:
         shutil.copytree(PACKAGE, unfinished, dirs_exist_ok=True)
     typer.echo(f"{made} is written; build it with: colcon build --packages-select {PACKAGE.name}")
@@ -237,7 +237,7 @@ def _print_or_write(text: str, output: Path | None, then: str) -> None:
         typer.echo(text, nl=False)
         return
     if output.exists():
-        raise ConfigError(f"{output} is there already: name another file")
+        raise ConfigError(f"{output} already exists: name another file")
     _write(output, text)
     typer.echo(f"{output} is written; {then}")
 
@@ -270,7 +270,7 @@ def install_service(
         raise ConfigError(f"--user {user!r} is not a name that a user can have")
     check_folders(loaded, user)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise ConfigError(f"{out} is there already: name a new folder with --out")
+        raise ConfigError(f"{out} already exists: name a new folder with --out")
     program, path = _find_program(), str(file.absolute())
     unit = unit_text([*program, "run", path], loaded.config, user)
     again = [*program, "install-service", path, "--user", user]

@@ -123,7 +123,7 @@ def _check_out(folder: Path, force: bool) -> None:
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return
     if not force:
-        raise ConfigError(f"{folder} is there already: name another folder, or give --force")
+        raise ConfigError(f"{folder} already exists: name another folder, or give --force")
     try:
         manifest = SweepManifest.read(folder)
     except RecordingError:

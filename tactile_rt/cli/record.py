@@ -204,9 +204,9 @@ def _write_folder(
         raise ConfigError(f"no folder {output.parent} to write {output.name} in")
     if output.exists():
         if not force:
-            raise ConfigError(f"{output} is there already: name another folder, or give --force")
+            raise ConfigError(f"{output} already exists: name another folder, or give --force")
         if not (output / MARKS[to]).is_file():
-            raise ConfigError(f"{output} is there already, and nothing that --to {to} made")
+            raise ConfigError(f"{output} already exists, and was not made by --to {to}")
     read = [Recording(path) for path in recordings]
     if to == "ros2":
         if task or video:

@@ -29,7 +29,7 @@ def test_bytes_become_a_recording_of_their_name(call, done, raw):
 
 def test_what_is_there_is_replaced_only_if_forced(call, refused, raw):
     call("import", "raw.bin", "--as", "codec=bota")
-    assert "is there already" in refused("import", "raw.bin", "--as", "codec=bota")
+    assert "already exists" in refused("import", "raw.bin", "--as", "codec=bota")
     assert call("import", "raw.bin", "--as", "codec=bota", "--force")[0] == 0
 
 

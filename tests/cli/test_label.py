@@ -196,7 +196,7 @@ def test_a_set_is_replaced_on_demand_and_nothing_else_is(here, night, tmp_path, 
     out = tmp_path / "set"
     shutil.copytree(night, out)
     err = refused("label", recording, out)
-    assert f"{out} is there already: name another folder, or give --force" in err
+    assert f"{out} already exists: name another folder, or give --force" in err
     _, err = lines_of(call, "label", recording, out, "--force", "--shares", "0.5,0.25,0.25")
     assert "24 of 24 touches" in err
     assert "is made of recordings, by `tactile-rt label`" in refused("sweep", out)

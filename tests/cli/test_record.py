@@ -102,13 +102,13 @@ def test_a_lerobot_dataset_is_made(call, refused, path):
     precious = path.with_name("precious")
     precious.mkdir()
     said = refused("convert", path, precious, "--to", "lerobot", "--force")
-    assert "nothing that --to lerobot made" in said
+    assert "was not made by --to lerobot" in said
 
 
 def test_a_file_that_is_there_is_not_written_over(call, refused, path):
     path.write_bytes(b"precious")
     said = refused("record", SOURCE, path)
-    assert said == f"tactile-rt: {path} is there already: name another file, or give --force\n"
+    assert said == f"tactile-rt: {path} already exists: name another file, or give --force\n"
     assert path.read_bytes() == b"precious"
     assert call("record", SOURCE, path, "--force")[0] == 0
     assert samples(path) == 300

@@ -132,7 +132,7 @@ def test_mistakes_are_one_line(call, lesson, tmp_path):
     for arguments, said in (
         (("synthetic:3x2", tmp_path / "a", "--classes", "a/b"), "cannot be part of a file's name"),
         (("synthetic:3x2", tmp_path / "a", "--classes", "unknown"), "has a meaning of its own"),
-        (("synthetic:3x2", tmp_path / "a", "--classes", "b,undo"), "is an order to who teaches"),
+        (("synthetic:3x2", tmp_path / "a", "--classes", "b,undo"), "is a command of `teach`"),
         (("synthetic:3x2", tmp_path / "a", "--page", "here"), "--page is HOST:PORT"),
         (("synthetic:3x2", tmp_path / "a\udcff", "--classes", "a"), "is no UTF-8: rename it"),
         (("synthetic:3x2", folder, "--json", folder / LABELS), "is a file of the lesson, or its"),

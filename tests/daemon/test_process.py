@@ -295,7 +295,7 @@ def test_what_hangs_at_the_end_is_left_behind(folder, started):
         (["run", "gone.toml"], "gone.toml: no such file"),
         (["run", "robot.toml", "--set", "page.port=0"], "page.port: expected a whole number >= 1"),
         (["config", "check", "robot.toml", "--set", "sorce=1"], "did you mean source?"),
-        (["config", "example", "robot.toml"], "robot.toml is there already"),
+        (["config", "example", "robot.toml"], "robot.toml already exists"),
         (["config", "example", "gone/robot.toml"], "no folder gone to write"),
     ],
 )

@@ -129,9 +129,9 @@ def test_the_page_of_results_is_what_was_found() -> None:
         ('than = "svm"', 'than = "svn"', "compares 'svn', which no cell is"),
         ('objective = "simclr"\naugmentation = "image"', "", "two cells are 'gru'"),
         ("[1e-3, 1e-2]", "[1e-3, -1e-2]", "cell 'gru': learning_rate must be positive"),
-        ("most = 2", "most = 0", "growth goes from 1 updates to 0, which is less"),
+        ("most = 2", "most = 0", "growth must not go from 1 updates to 0"),
         ("train = 2", "train = -1", "sweeps are counted from 0"),
-        ("clip_norm = 2", "seed = 2", "supervised: seed is what the grid itself decides"),
+        ("clip_norm = 2", "seed = 2", "supervised: seed is set by the grid itself"),
         (
             'augmentation = "image"',
             'augmentation = "image"\nbegin = "gru"\nseeds = 3',

@@ -238,7 +238,7 @@ def test_what_is_there_already_is_only_replaced_by_force(whole, tmp_path):
     cut_off.write_bytes(data[: ends[4] + 9])
     there = tmp_path / "cut.recovered.mcap"
     there.write_bytes(b"mine")
-    with pytest.raises(ConfigError, match="is there already"):
+    with pytest.raises(ConfigError, match="already exists"):
         recover(cut_off)
     assert there.read_bytes() == b"mine"
     assert recover(cut_off, force=True) == there

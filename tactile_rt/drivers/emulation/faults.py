@@ -95,7 +95,9 @@ class Fault:
             if not 0 <= getattr(self, name) < math.inf:
                 raise ConfigError(f"{name} must be 0 or more, not {getattr(self, name)}")
         if (self.rate > 0) == (self.at_s is not None):
-            raise ConfigError("give either rate, per second, or at_s, once")
+            raise ConfigError(
+                "give either rate (faults per second) or at_s (time of a single fault)"
+            )
         if self.at_s is not None and not QUIET_S <= self.at_s < math.inf:
             raise ConfigError(
                 f"at_s must be {QUIET_S} or more (undisturbed before), not {self.at_s}"

@@ -120,7 +120,10 @@ class Graph:
                     sizes[node.name] = _shrink(node, rows, columns)
         for node in self.nodes:
             if node.name not in sizes:
-                raise ConfigError(f"{node.name}: reads no map, but is {node.kind!r}; make it dense")
+                raise ConfigError(
+                    f"{node.name}: kind {node.kind!r} needs a map as input, but it reads only vectors; "
+                    "use kind dense"
+                )
         for node in self.nodes:
             maps = {sizes[e.source] for e in node.reads} - {(1, 1)}
             fits = node.kind == "dense" or {_shrink(node, *m) for m in maps} == {sizes[node.name]}

@@ -250,7 +250,7 @@ def _load_animal(path: Path, animal: _Animal) -> WhiskerArray:
     name = animal.array
     if Path(name).suffix.lower() in ARRAY_FILES:
         if (path.parent / name).resolve() == path.resolve():
-            raise ConfigError(f"{path}: an animal's array is another file, not this one")
+            raise ConfigError(f"{path}: [[animal]] array names this file itself; name another file")
         name = str(path.parent / name)
     array = load_array(name)
     return replace(array, mount=_make_mount(path, animal.mount)) if animal.mount else array

@@ -267,12 +267,12 @@ def test_a_schedule_unplugs_and_replugs(tmp_path: Path) -> None:
 
 def test_a_name_that_is_taken_is_not_taken_away(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("mine")
-    with pytest.raises(ConfigError, match="file is there already: name another link"):
+    with pytest.raises(ConfigError, match="file already exists: name another link"):
         native(1, endpoint=SerialEndpoint(tmp_path / "file")).start()
     with pytest.raises(ConfigError, match="No such file or directory"):
         native(1, endpoint=SerialEndpoint(tmp_path / "no" / "port")).start()
     with native(1, endpoint=SerialEndpoint(tmp_path / "port")):
-        with pytest.raises(ConfigError, match="port is there already"):
+        with pytest.raises(ConfigError, match="port already exists"):
             native(1, endpoint=SerialEndpoint(tmp_path / "port")).start()
 
 

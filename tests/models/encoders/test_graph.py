@@ -111,10 +111,10 @@ def test_width_scales_every_node_but_not_the_frame():
         ('"up", "down"', '"up", "up"', "down: reads the same node twice"),
         ('["up", "down"]', "[]", "down: the first edge"),
         ('["up", "down"]', "[3]", r"nodes\.down\.reads\[0\]: expected text or a table, got 3"),
-        ('["up", "down"]', '["down"]', "down: reads no map"),
+        ('["up", "down"]', '["down"]', "down: kind .* needs a map as input"),
         ('["up", "down"]', '["up", "frame"]', "down: .* differ in size .*frame 5x7"),
         ("rows = 5", "rows = 0", "frame: 0 x 7 sites"),
-        ("rows = 5", "rows = 1", "first: .* no site|reads no map|no site is left"),
+        ("rows = 5", "rows = 1", "first: .* no site|needs a map|no site is left"),
         ("channels = 64", "channels = 0", "up: channels is 0"),
         (
             "channels = 64",
