@@ -194,7 +194,7 @@ def _run_task(task: _Task) -> Trial:
             logits = stepper.run()
             took.append(time.monotonic() - start)
             if decides and not np.isfinite(logits).all():
-                raise ModelError(f"{path} is refused: its answer to {name} is no number")
+                raise ModelError(f"{path} is refused: its logits for {name} are not finite")
         step_s = max(step_s, float(np.median(took)))
     return Trial(sha256, load_s, step_s, (_read_data_bytes() - before) / MB)
 

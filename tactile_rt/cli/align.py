@@ -201,7 +201,7 @@ def decode_stimuli(
         felt = read_stimuli(stimuli)
         frozen = load_strict(benchmark) if benchmark else None
         if frozen and frozen.stimuli != STIMULI:
-            raise ConfigError(f"{benchmark}: shape and distance are those of the six stimuli alone")
+            raise ConfigError(f"{benchmark}: shape and distance exist only for the six stimuli")
         targets = frozen.targets if frozen else ()
         recorded, notes = animal_means(animals) if animals else ({}, [])
         names = check_models(models)

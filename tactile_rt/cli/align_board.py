@@ -141,7 +141,7 @@ def write_board(
                 names = read.animals[0].sessions[0].stimuli
                 if names != (first := first or names):
                     raise ConfigError(
-                        f"{path} is of other stimuli than {sources[0][1]}: a board each"
+                        f"{path} has other stimuli than {sources[0][1]}: make a board for each"
                     )
                 rows = _make_rows(files, read.stimuli or felt, seed, update, names)
             with share_bar(f"scoring on {dataset.name}") as tell:

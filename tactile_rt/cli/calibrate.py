@@ -71,7 +71,7 @@ def tare(
     if not told_as_json(results, json):
         _show_tare(measured)
     if untared:
-        typer.echo(f"not tared, for want of valid samples: {', '.join(measured.untared)}", err=True)
+        typer.echo(f"not tared, too few valid samples: {', '.join(measured.untared)}", err=True)
     if louder:
         typer.echo(
             f"more than {LOUDER:g} times as noisy as when last tared: {', '.join(louder)}; did "
@@ -114,7 +114,7 @@ def calibrate(
         recorded, spec = _read_samples(table, loads, source)
         fresh = Calibration.of(device or (path.stem if path else "unnamed"), spec)
     elif source:
-        raise ConfigError(f"{table} has readings of its own: leave out --source")
+        raise ConfigError(f"{table} has readings: leave out --source")
     else:
         fresh = Calibration(
             device or (path.stem if path else "unnamed"),

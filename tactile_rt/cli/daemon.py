@@ -90,7 +90,7 @@ def run(
         except SpecMismatch as error:
             raise SpecMismatch(f"{source}: {error}") from None
         if is_made_up(source):
-            typer.echo(f"{source} is made up: what is decided on it means nothing", err=True)
+            typer.echo(f"{source} is made up: decisions on it mean nothing", err=True)
         session, card = Session(opened, classifier), classifier.card
         stuck_at, stuck = StuckAtDetector(opened.spec.rate_hz), tuple[int, ...]()
         if device_of(opened) is not None:
@@ -104,9 +104,7 @@ def run(
                 found = all_of_them if stuck_at.seconds else stuck_at.elements
                 if set(found) - set(stuck):
                     names = name_some([opened.spec.elements[k] for k in found])
-                    typer.echo(
-                        f"no value of {names} changes: it hangs, or is out of range", err=True
-                    )
+                    typer.echo(f"no value of {names} changes: stuck, or out of range", err=True)
                 stuck = found
                 for d in decisions:
                     if final_only and not d.final:
@@ -178,7 +176,7 @@ def check(file: File, sets: Settings = None) -> None:
     typer.echo(f"{file}: {', '.join([*counts, *tables])}: all right")
     for source in found.source:
         if found.model and is_made_up(source.url):
-            typer.echo(f"source {source.name} is made up: what is decided on it means nothing")
+            typer.echo(f"source {source.name} is made up: decisions on it mean nothing")
 
 
 @config.command(epilog="tactile-rt config show robot.toml --set page.port=9000")

@@ -86,7 +86,7 @@ def emulate(
     if wire not in ("serial", "slcan", "can"):
         raise ConfigError(f"--wire must be serial, slcan or can, not {wire!r}")
     if (wire == "can") != (bus is not None):
-        raise ConfigError("--wire can needs --bus INTERFACE:CHANNEL, and only it takes one")
+        raise ConfigError("--bus INTERFACE:CHANNEL goes with --wire can: give both or neither")
     if bus is not None and link is not None:
         raise ConfigError("--link names a port; a --bus has none")
     speed = "baud" if wire == "serial" else "bitrate"  # of the line, unless the codec has it, too
@@ -133,7 +133,7 @@ def codec_options(given: list[str]) -> dict[str, str]:
     for pair in given:
         name, equals, value = pair.partition("=")
         if not equals or not name:
-            raise ConfigError(f"--set {pair}: an option is KEY=VALUE")
+            raise ConfigError(f"--set {pair}: an option must be KEY=VALUE")
         if name in fields:
             raise ConfigError(f"--set {name}=... is given twice")
         fields[name] = value
@@ -213,7 +213,7 @@ def hil(
         if sweeps is not None or seconds is None:
             source = _add_option(source, "sweeps", str(sweeps or SWEEPS))
     elif sweeps is not None:
-        raise ConfigError("--sweeps is of a sim: source; of others give --seconds")
+        raise ConfigError("--sweeps needs a sim: source; for others give --seconds")
     opened = open_url(source)
     try:
         loop = Loop(opened, file, wire, codec, fields, schedule, seconds)

@@ -78,7 +78,7 @@ def import_file(
         with needing("view"):  # before anything is read
             import matplotlib  # noqa: F401
     if decimal not in ("", ",", "."):
-        raise ConfigError(f"--decimal is , or ., not {decimal!r}")
+        raise ConfigError(f"--decimal must be , or ., not {decimal!r}")
     with ExitStack() as stack:
         target = output
         if strict:  # hidden until it is known to be in order
@@ -96,7 +96,7 @@ def import_file(
             if is_bag(log):
                 if decoded_as:
                     raise ConfigError(
-                        f"{log} is a bag: its messages are no bytes of a codec; no --as"
+                        f"{log} is a bag: its messages are not bytes of a codec; leave out --as"
                     )
                 made = import_bag(log, target, topic, columns, rate)
             elif decoded_as and columns:
@@ -120,7 +120,7 @@ def import_file(
         for note in made.notes:
             typer.echo(f"{log}: {note}", err=True)
         if strict and odd:
-            raise ConfigError(f"{log}: {odd[0]:.100}; nothing is written, as --strict wants it")
+            raise ConfigError(f"{log}: {odd[0]:.100}; nothing is written (--strict)")
         if plot is not None:
             draw_import(target, made, odd, plot)
         if strict:

@@ -107,7 +107,7 @@ def _parse_shares(text: str) -> tuple[float, ...]:
         shares = tuple(map(float, text.split(",")))
     except ValueError:
         raise ConfigError(
-            f"--shares is TRAIN,VALIDATION,TEST, as 0.7,0.15,0.15, not {text!r}"
+            f"--shares must be TRAIN,VALIDATION,TEST, as 0.7,0.15,0.15, not {text!r}"
         ) from None
     check_shares(shares)
     return shares
@@ -129,7 +129,11 @@ def _check_out(folder: Path, force: bool) -> None:
     except RecordingError:
         manifest = None
     if manifest is None or not manifest.recorded:
-        raise ConfigError(f"{folder} is no set of recordings, and stays: name another folder")
+        raise ConfigError(
+            f"{folder} is not a set of recordings, and is not replaced: name another folder"
+        )
     own = {MANIFEST, SUMS, *(object_path(folder, name).name for name in manifest.names())}
     if others := sorted({path.name for path in folder.iterdir()} - own):
-        raise ConfigError(f"{folder} holds {others[0]!r}, too, and stays: name another folder")
+        raise ConfigError(
+            f"{folder} holds {others[0]!r}, too, and is not replaced: name another folder"
+        )

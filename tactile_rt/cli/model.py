@@ -130,7 +130,7 @@ def bench(
 
     card, _, _ = read_model(file)
     if card.kind != "step":
-        raise ModelError(f"{file} is a model of kind {card.kind!r}: only steps are timed")
+        raise ModelError(f"{file} is a {card.kind} model: only step models are timed")
     with progress_bar("measuring"):
         records = measure_model(Subject("model", file), steps)
     show_records(records, json)

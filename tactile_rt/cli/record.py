@@ -96,7 +96,7 @@ def _parse_notes(given: list[str]) -> dict[str, str]:
     for pair in given:
         name, equals, value = pair.partition("=")
         if not equals or not name or name == "crc32":
-            raise ConfigError(f"--note is NAME=VALUE, not {pair!r}")
+            raise ConfigError(f"--note must be NAME=VALUE, not {pair!r}")
         notes[name] = value
     return notes
 
@@ -167,7 +167,7 @@ def convert(
         _print_results(results, json)
         return
     if len(files) != 2:
-        raise ConfigError("name a recording and what to write, or say what --to")
+        raise ConfigError("name a recording and the file to write, or give --to")
     recording, output = files
     check_new(output, force)
     with progress_bar(f"converting {recording}"):

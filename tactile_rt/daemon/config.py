@@ -181,7 +181,7 @@ version = 1
 [[source]]
 name = "whiskers"
 url = "replay:demo?loop=true"  # six recorded objects; a device: serial:///dev/ttyACM0?codec=native
-                               # "synthetic:mouse" is made up: what is decided on it means nothing
+                               # "synthetic:mouse" is made up: decisions on it mean nothing
 # calibration = "cell-3"       # file, or id of a device: tactile-rt calibrate
 # stuck_at_s = 0                 # no change for so long: stuck-at fault; 0: if its noise is known
 # array = "array.json"         # what the device is, if its codec cannot know; or a model's .onnx

@@ -89,7 +89,7 @@ class _PlainUnpickler(pickle.Unpickler):
             return OrderedDict
         if module.partition(".")[0] == "torch":
             return _skip_tensor
-        raise ModelError(f"it asks for {module}.{name}")
+        raise ModelError(f"it refers to {module}.{name}")
 
 
 def _skip_tensor(*_: Any) -> None:

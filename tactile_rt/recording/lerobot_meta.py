@@ -69,7 +69,7 @@ def film_of(text: str) -> CameraFilm:
     except ValueError:  # the @ is part of the file's name
         file, begin_s = place, 0.0
     if not (equals and name.replace("_", "").isalnum() and file and np.isfinite(begin_s)):
-        raise ConfigError(f"--video is NAME=FILE or NAME=FILE@SECONDS, not {text!r}")
+        raise ConfigError(f"--video must be NAME=FILE or NAME=FILE@SECONDS, not {text!r}")
     av = _import_av()
     try:
         with av.open(file) as film:

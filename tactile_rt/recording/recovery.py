@@ -111,7 +111,9 @@ def _copy(path: Path, records: "Iterator[Record]", new: BinaryIO, about: Descrip
             else:
                 none += 1
         if none > MOST_NONE:
-            raise RecordingError(f"{path} is no recording: more than {MOST_NONE} messages are none")
+            raise RecordingError(
+                f"{path} is no recording: more than {MOST_NONE} messages cannot be decoded"
+            )
     if not whole:
         raise RecordingError(f"{path}: nothing in it is whole")
     file.finish()

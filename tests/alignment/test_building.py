@@ -41,7 +41,7 @@ def test_a_published_file_builds_a_paper_code_benchmark(rates, tmp_path):
 def test_its_stimuli_have_no_names_so_strict_refuses_it(rates, tmp_path):
     np.savez_compressed(tmp_path / "rates.npz", **rates)
     assert "its stimuli have no names" in refusal(build, [tmp_path / "rates.npz"])
-    with pytest.raises(ConfigError, match="name nothing beside it"):
+    with pytest.raises(ConfigError, match="give no other file"):
         build([tmp_path / "rates.npz", tmp_path], "paper-code")
 
 

@@ -106,10 +106,10 @@ def torch():
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (("--set", "width=0.1"), "width is 0.1, must be a positive multiple of 1/32"),
+        (("--set", "width=0.1"), "width must be a positive multiple of 1/32"),
         (("--set", "attender=lstm"), "attender is 'lstm', not one of gpt, mamba, none"),
         (("--seed", -1), "seed must be 0 to 4294967295"),
-        (("--set", "learning_rate=nan"), "--set learning_rate=nan: nan is no quantity"),
+        (("--set", "learning_rate=nan"), "--set learning_rate=nan: nan is not a finite number"),
         (("--accelerator", "glove"), "accelerator is 'glove': "),
         (("--threads", 10**30), "'--threads'"),
         (

@@ -203,7 +203,7 @@ def test_a_set_is_replaced_on_demand_and_nothing_else_is(here, night, tmp_path, 
     assert [p.name for p in tmp_path.iterdir()] == ["set"]
     lines_of(call, "sweep", out, "--verify")
     err = refused("label", recording, here / "data" / "robot", "--force")
-    assert "is no set of recordings, and stays" in err
+    assert "is not a set of recordings, and is not replaced" in err
     (out / "notes.txt").touch()
     err = refused("label", recording, out, "--force")
     assert f"{out} holds 'notes.txt', too, and stays" in err
@@ -222,9 +222,9 @@ def test_what_is_wrong_is_one_line(here, tmp_path, refused):
         ((recording, out, "--labels", said), "said.csv:3: end_s: expected a number, got 'x'"),
         ((recording, out, "--by-name", "--unlabelled"), "exclude one another: give one"),
         ((recording, recording, out), "is named twice: name it once"),
-        ((recording, out, "--shares", "much"), "--shares is TRAIN,VALIDATION,TEST"),
+        ((recording, out, "--shares", "much"), "--shares must be TRAIN,VALIDATION,TEST"),
         ((recording, out, "--like", tmp_path), "is not a sweep set"),
-        ((recording, tmp_path / "o\udcff"), "o\\udcff' is no UTF-8: rename it"),
+        ((recording, tmp_path / "o\udcff"), "o\\udcff' is not UTF-8: rename it"),
         ((recording, out, "--json", recording), "is another file of this command"),
         ((recording, out, "--json", here / "labels.csv"), "holds the labels that are read"),
         ((recording, out, "--json", out), "is another file of this command"),

@@ -126,11 +126,11 @@ def test_the_page_of_results_is_what_was_found() -> None:
         ("[1e-3, 1e-2]", "[]", "search needs a learning_rate and a warmup"),
         ('encoder = "gru"\nobj', 'encoder = "gru"\nshare = 2\nobj', "share must be above 0"),
         ('encoder = "gru"\nobj', 'encoder = "gru"\nbegin = "s4"\nobj', "begins with 's4', which"),
-        ('than = "svm"', 'than = "svn"', "compares 'svn', which no cell is"),
+        ('than = "svm"', 'than = "svn"', "compares 'svn', but no cell has that name"),
         ('objective = "simclr"\naugmentation = "image"', "", "two cells are 'gru'"),
         ("[1e-3, 1e-2]", "[1e-3, -1e-2]", "cell 'gru': learning_rate must be positive"),
         ("most = 2", "most = 0", "growth must not go from 1 updates to 0"),
-        ("train = 2", "train = -1", "sweeps are counted from 0"),
+        ("train = 2", "train = -1", "sweeps must be 0"),
         ("clip_norm = 2", "seed = 2", "supervised: seed is set by the grid itself"),
         (
             'augmentation = "image"',

@@ -322,7 +322,7 @@ def test_a_validation_without_a_touch_is_told_before_the_training(tiny, tmp_path
     monkeypatch.setattr(
         loop, "Validation", lambda config, data, *rest: Validation(config, data[:0], *rest)
     )
-    with pytest.raises(ConfigError, match="in no validation sweep was a touch found"):
+    with pytest.raises(ConfigError, match="no touch was found in the validation sweeps"):
         train(TrainingConfig(tiny, **SMALL, objective="simclr", updates=1), tmp_path / "run")
 
 

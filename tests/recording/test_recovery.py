@@ -257,7 +257,7 @@ def test_so_many_messages_may_be_none_and_not_one_more(none, comes_back, tmp_pat
     if comes_back:
         assert all_parts(Recording(recover(path))) == all_parts([chunk])
     else:
-        with pytest.raises(RecordingError, match="messages are none"):
+        with pytest.raises(RecordingError, match="messages cannot be decoded"):
             recover(path)
 
 

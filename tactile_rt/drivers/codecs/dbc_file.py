@@ -307,7 +307,7 @@ class _Reader:
             return None
         _, signal = self._find_signal(f"{self.path}, {what}", entry.signal)
         if signal.real:
-            raise ConfigError(f"{self.path}, {what}: {entry.signal} must be of whole numbers")
+            raise ConfigError(f"{self.path}, {what}: {entry.signal} must have whole numbers")
         return signal
 
     def _make_parts(self) -> tuple[FramePart, ...]:

@@ -103,12 +103,12 @@ class Fault:
                 f"at_s must be {QUIET_S} or more (undisturbed before), not {self.at_s}"
             )
         if self.duration_s and not kind.lasts:
-            raise ConfigError(f"duration_s: {self.kind} has none")
+            raise ConfigError(f"{self.kind} takes no duration_s")
         if kind.lasts and self.kind not in FOR_EVER and not self.duration_s:
             raise ConfigError(f"duration_s must be more than 0 for {self.kind}")
         if self.amount is not None:
             if not kind.unit:
-                raise ConfigError(f"amount: {self.kind} has none")
+                raise ConfigError(f"{self.kind} takes no amount")
             if not math.isfinite(self.amount):
                 raise ConfigError(f"amount must be a number, not {self.amount}")
             if kind.whole and (self.amount < 1 or self.amount % 1):

@@ -283,7 +283,7 @@ def _check_grid(grid: Grid) -> None:
     untrained: dict[str, Candidate] = {}
     for cell in grid.cells:
         if cell.name in before:
-            raise ConfigError(f"two cells are {cell.name!r}")
+            raise ConfigError(f"two cells are named {cell.name!r}")
         _check_cell(grid, cell, before)
         bare = grid.make_untrained(cell)
         if untrained.setdefault(cell.network, bare) != bare:
@@ -296,7 +296,7 @@ def _check_grid(grid: Grid) -> None:
     for question in grid.questions:
         for one in (name for pair in question.pairs for name in (pair.better, pair.than)):
             if one not in known:
-                raise ConfigError(f"{question.text!r} compares {one!r}, which no cell is")
+                raise ConfigError(f"{question.text!r} compares {one!r}, but no cell has that name")
 
 
 def _check_cell(grid: Grid, cell: Candidate, before: dict[str, Candidate]) -> None:
@@ -309,7 +309,9 @@ def _check_cell(grid: Grid, cell: Candidate, before: dict[str, Candidate]) -> No
         )
     if cell.begin:
         if cell.begin not in before:
-            raise ConfigError(f"{called} begins with {cell.begin!r}, which no cell before it is")
+            raise ConfigError(
+                f"{called} begins with {cell.begin!r}, but no earlier cell has that name"
+            )
         has, wants = (one.seeds or grid.seeds for one in (before[cell.begin], cell))
         if has < wants:
             raise ConfigError(

@@ -66,8 +66,7 @@ def build_objective(config: TrainingConfig, training: SweepSet) -> "Objective":
         objects = training.sweeps.objects
         if config.identity and len(set(objects.tolist())) == len(objects):
             raise ConfigError(
-                f"identity: no object of {config.data} has two sweeps to be told as one: make more "
-                "of each"
+                f"identity: no object of {config.data} has two sweeps: make more of each"
             )
         class_of = [manifest.categories.index(c) for c in kinds for _ in kinds[c]]
         return Supervised(

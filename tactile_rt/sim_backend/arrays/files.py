@@ -218,7 +218,7 @@ def _read_toml(path: Path, nodes: settings.SettingNode) -> tuple[WhiskerArray, .
             (file.name, file.mirror, any(file.gravity_m_s2), file.mount, file.sensor, file.defaults)
         ):
             raise ConfigError(
-                f"{path}: beside [[animal]] tables there is nothing else; name, mirror, "
+                f"{path}: beside [[animal]] tables no other keys are allowed; name, mirror, "
                 f"gravity_m_s2, mount, sensor and defaults belong in the file of an array"
             )
         animals = [_load_animal(path, animal) for animal in file.animal]

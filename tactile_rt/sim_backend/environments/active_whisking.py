@@ -151,7 +151,7 @@ class ActiveWhisking(gymnasium.Env[Observation, NDArray[np.float32]]):
         if task not in ("classify", "locate"):
             raise ConfigError(f"task must be classify or locate, not {task!r}")
         if len(kinds) < 2:
-            raise ConfigError("kinds: name two or more, there is nothing to distinguish")
+            raise ConfigError("kinds must be two or more")
         for kind in kinds:
             promised_object(f"{kind}-0")  # raises if the kind does not exist
         if not 0 <= instances[0] < instances[1]:

@@ -166,7 +166,7 @@ def test_animals_in_one_world_have_names_and_cells_of_their_own() -> None:
 
 def test_animals_are_not_put_in_the_same_place() -> None:
     mouse = load_array("mouse")
-    assert "animal 2 (mouse-right) stands in another" in refusal(place, [mouse, mouse])
+    assert "animal 2 (mouse-right) overlaps another" in refusal(place, [mouse, mouse])
     assert "must be finite" in refusal(Mount, (0.0, np.nan, 0.0), (0.0, 0.0, 0.0))
 
 
@@ -302,7 +302,7 @@ def test_a_toml_array_has_a_mount_and_defaults(tmp_path: Path) -> None:
         ),
         ("[[animal]]\narray = 'mouse'\n" + WHISKERS, "tables, one of the two"),
         ("name = 'x'\n[[animal]]\narray = 'mouse'", "there is nothing else"),
-        ("[[animal]]\narray = 'a.toml'", "another file, not this one"),
+        ("[[animal]]\narray = 'a.toml'", "names this file itself"),
         ("[[animal]]\narray = 'no.csv'", "no.csv: no such file"),
         ("[[animal]]\narray = 'rat'\n[[animal]]\narray = 'rat'", "a.toml: animal 2 .* in another"),
     ],

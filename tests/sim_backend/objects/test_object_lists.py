@@ -152,7 +152,8 @@ def test_objects_are_fetched(shapes, tmp_path: Path, monkeypatch: pytest.MonkeyP
     server.shutdown()
     server.server_close()
     assert (
-        list(why) == ["chair/one"] and "seat.obj: cannot be got (HTTP Error 404" in why["chair/one"]
+        list(why) == ["chair/one"]
+        and "seat.obj: cannot be downloaded (HTTP Error 404" in why["chair/one"]
     )
     assert (tmp_path / "again" / "box" / "brick.ply").exists()
 
@@ -164,7 +165,7 @@ def test_a_file_that_is_not_what_the_list_means_is_not_used(shapes, tmp_path, ca
     back.write_bytes(kept + b" ")
     code, out, err = call("objects", "get", wanted, tmp_path / "got", "--clones", clones)
     assert code == 1 and out.startswith("1 of 2 objects")
-    assert "some/shapes/meshes/the back.stl: is not what the list means (sha256 " in err
+    assert "some/shapes/meshes/the back.stl: is not the listed file (sha256 " in err
     assert not (tmp_path / "got" / "chair").exists()
     back.write_bytes(kept)  # and it goes on with what is missing
     (tmp_path / "got" / "box" / "brick.ply").write_bytes(b"kept")
@@ -179,8 +180,8 @@ def test_a_file_that_is_not_what_the_list_means_is_not_used(shapes, tmp_path, ca
         ({"name": "../up"}, "category and name may hold no /"),
         ({"sha256": "abc"}, "sha256"),
         ({"up": "x"}, "up"),
-        ({"scale": "big"}, "scale is a number of metres, not 'big'"),
-        ({"scale": "inf"}, "scale is a number of metres, not 'inf'"),
+        ({"scale": "big"}, "scale must be a number of metres, not 'big'"),
+        ({"scale": "inf"}, "scale must be a number of metres, not 'inf'"),
         ({"commit": "1.8-1"}, "commit is a version of a package of debian or pypi"),
         ({"repository": "pypi/shapes"}, "commit is a version of a package of debian or pypi"),
     ],
