@@ -245,7 +245,7 @@ class _Walk:
         for what, start, stop in self.messages(at, end, key=1, value=2):
             pair[what] = self.text(start, stop)
         if pair["key"] in self.found.metadata:
-            raise BadModel(f"metadata {pair['key'][:40]!r} twice")
+            raise BadModel(f"metadata key {pair['key'][:40]!r} appears twice")
         self.found.metadata[pair["key"]] = pair["value"]
 
     def graph(self, at: int, end: int, depth: int) -> tuple[list[str], list[str]]:

@@ -230,7 +230,7 @@ def hil(
     if not told_as_json(results, json):
         print_table(_make_table(report, source, f"{codec} over {wire}"))
     if not loop.complete:
-        typer.echo("interrupted: what was on its way is missing above", err=True)
+        typer.echo("interrupted: samples still in transit are not counted above", err=True)
         raise typer.Exit(INTERRUPTED)
     if report.failure:
         typer.secho(f"tactile-rt: {report.failure}", err=True, fg="red")

@@ -140,7 +140,7 @@ def test_the_page_of_results_is_what_was_found() -> None:
         (
             'augmentation = "image"',
             'augmentation = "image"\noptions = { preprocessing = "paper" }',
-            "another than that of a cell before it that is called 'gru'",
+            "its network differs from that of an earlier cell that is also called 'gru'",
         ),
     ],
 )
@@ -360,7 +360,7 @@ def test_a_cell_begins_with_another_and_learns_from_fewer_objects(plan: Path) ->
     few = bench.splits_of(0.5)[0]
     assert set(few.sweeps.objects) == {"mug-0", "mug-1", "car-0", "car-1"}
     assert bench.splits_of(1.0)[0] is bench.splits[0]
-    said = "'gru simclr image' diverged, and there is nothing to begin with"
+    said = "'gru simclr image' diverged, so there is no checkpoint to begin with"
     assert bench.do(task).failed == said
     (before,) = [t for t in grid.tasks() if t.slug in grid.needs(task)]
     assert not bench.do(before).failed

@@ -288,8 +288,8 @@ def _check_grid(grid: Grid) -> None:
         bare = grid.make_untrained(cell)
         if untrained.setdefault(cell.network, bare) != bare:
             raise ConfigError(
-                f"cell {cell.name!r}: the network is another than that of a cell before it that "
-                f"is called {cell.network!r} too: give one a width"
+                f"cell {cell.name!r}: its network differs from that of an earlier cell that is "
+                f"also called {cell.network!r}: give one a width"
             )
         before[cell.name] = cell
     known = {task.name for task in grid.tasks()}

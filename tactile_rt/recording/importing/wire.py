@@ -137,7 +137,7 @@ def _prepare(
         codec.spec = read_array(Path(array))
         written["array"] = codec.spec.to_json()
     elif array:
-        raise ConfigError(f"array= is for devices that are asked what they are, not for {name}")
+        raise ConfigError(f"array= is not for codec {name}, which has its own array")
     if rate_hz and codec.spec is not None and codec.spec.rate_hz != rate_hz:
         codec.spec = replace(codec.spec, rate_hz=rate_hz)
     about = Description(

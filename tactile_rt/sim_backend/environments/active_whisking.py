@@ -155,9 +155,7 @@ class ActiveWhisking(gymnasium.Env[Observation, NDArray[np.float32]]):
         for kind in kinds:
             promised_object(f"{kind}-0")  # raises if the kind does not exist
         if not 0 <= instances[0] < instances[1]:
-            raise ConfigError(
-                f"instances must be the first and the one after the last, not {instances}"
-            )
+            raise ConfigError(f"instances must be (first, one after the last), not {instances}")
         if touches < 0:
             raise ConfigError(f"touches must be 0 or more, not {touches}")
         if step_ms < FRAMES or step_ms % FRAMES:

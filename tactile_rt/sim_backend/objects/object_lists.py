@@ -111,8 +111,8 @@ def read_list(name: str) -> tuple[ListedObject, ...]:
         packaged = file.repository.split("/")[0] in PACKAGES
         if packaged != (len(file.commit) < 40):
             raise ConfigError(
-                f"{row.where}: commit is a version of a package of {' or '.join(PACKAGES)}, and "
-                f"of 40 digits elsewhere, not {file.commit!r}"
+                f"{row.where}: commit must be a version for a package of {' or '.join(PACKAGES)}, "
+                f"and 40 digits elsewhere, not {file.commit!r}"
             )
         if ".." in parts or file.path.startswith("/"):
             raise ConfigError(f"{row.where}: {file.path!r} leads out of its repository")
