@@ -160,8 +160,8 @@ def load_strict(path: Path) -> Benchmark:
     benchmark = load_benchmark(path)
     if benchmark.protocol != "strict":
         raise ConfigError(
-            f"{path} was built with protocol {benchmark.protocol}, which orders the stimuli of each "
-            "session by first appearance: build it with protocol strict"
+            f"{path} was built with protocol {benchmark.protocol}, which orders the stimuli of "
+            "each session by first appearance: build it with protocol strict"
         )
     return benchmark
 
