@@ -117,7 +117,7 @@ def test_requests_that_cannot_be_met(tmp_path):
     with pytest.raises(ConfigError, match="no protocol 'loose': there are strict, paper-code"):
         build([tmp_path], "loose")
     assert "name NWB files" in refusal(build, [])
-    assert "0 bootstraps" in refusal(build, [tmp_path], bootstraps=0)
+    assert "bootstraps must be 1 or more" in refusal(build, [tmp_path], bootstraps=0)
 
 
 def test_without_h5py_it_says_what_to_install(tmp_path, monkeypatch):

@@ -108,5 +108,5 @@ def test_a_brain_that_cannot_be(tmp_path):
             Brain(**wrong)
     with pytest.raises(ConfigError, match="already exists"):
         write_example(tmp_path, SMALL)
-    with pytest.raises(ConfigError, match="at least 0"):
+    with pytest.raises(ConfigError, match="seed must be 0 or more"):
         write_example(tmp_path / "x", SMALL, seed=-1)

@@ -176,7 +176,7 @@ def test_sessions_of_few_spikes_are_no_copies():
     [
         ({"stimulus": np.full(48, -1)}, "stimuli must be numbers from 0 to 5"),
         ({"rates": np.full((48, 9), np.nan)}, "a rate is not finite"),
-        ({"rates": np.zeros((47, 9))}, "rates need a stimulus"),
+        ({"rates": np.zeros((47, 9))}, ".* rates need a stimulus"),
         ({"depth": np.zeros(3)}, r"depth is \(3,\), not \(9,\)"),
         ({"course": np.zeros((48, 22, 3))}, "course is .* not .trial, bin, unit"),
         ({"begin": np.zeros(3)}, r"begin is \(3,\), not \(48,\)"),

@@ -182,8 +182,8 @@ def test_a_file_that_is_not_what_the_list_means_is_not_used(shapes, tmp_path, ca
         ({"up": "x"}, "up"),
         ({"scale": "big"}, "scale must be a number of metres, not 'big'"),
         ({"scale": "inf"}, "scale must be a number of metres, not 'inf'"),
-        ({"commit": "1.8-1"}, "commit is a version of a package of debian or pypi"),
-        ({"repository": "pypi/shapes"}, "commit is a version of a package of debian or pypi"),
+        ({"commit": "1.8-1"}, "commit must be a version for a package of debian or pypi"),
+        ({"repository": "pypi/shapes"}, "commit must be a version for a package of debian or pypi"),
     ],
 )
 def test_a_wrong_row_is_named(tmp_path: Path, change: dict[str, str], said: str) -> None:
