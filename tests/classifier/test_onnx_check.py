@@ -139,7 +139,7 @@ HOSTILE = {
     "constant": (external("/etc/passwd", in_constant), "'far' is in another file"),
     "branch": (external("/etc/passwd", in_branch), "'far' is in another file"),
     "sparse": (external("/etc/passwd", in_sparse), "'far' is in another file"),
-    "huge": (initialiser(data_type=1, dims=[2**31, 2**31]), "'big' of 4611686018427387904 elem"),
+    "huge": (initialiser(data_type=1, dims=[2**31, 2**31]), "'big' has 4611686018427387904 elem"),
     "negative": (initialiser(data_type=1, dims=[-1]), "'big' has 18446744073709551615 elements"),
     "raw": (initialiser(data_type=1, dims=[4], raw_data=b"123"), "does not hold its 4 elements"),
     "type": (initialiser(data_type=99, dims=[1], raw_data=b"1234"), "does not hold its 1 elem"),

@@ -100,7 +100,7 @@ def test_without_a_sensor_only_forces_and_moments_are_believed() -> None:
         (
             SENSOR,
             {"channels": (FIELD,), "magnet": MAGNET, "matrix": {"A0": ((0.0,) * 6,)}},
-            "which a matrix cannot say",
+            "which a matrix cannot describe",
         ),
         (MAGNET, {"moment_a_m2": 0.0}, "must not be 0"),
         (MAGNET, {"sensor_mm": (0, 0, 0)}, "must be apart"),

@@ -242,7 +242,7 @@ def test_cells_have_the_names_that_are_known_without_torch():
 @pytest.mark.parametrize(
     ("file", "change", "said"),
     [
-        ("config.json", None, "config.json is gone, so that nobody knows what run this is"),
+        ("config.json", None, "config.json is missing, so that this run cannot be identified"),
         ("best.pt", None, r"no checkpoint .*: delete .*last.pt to begin the run anew"),
         ("best.pt", lambda b: b[:900], r"is not a checkpoint .*: delete .*last.pt to begin"),
         ("history.csv", lambda b: b"\xff\xfe", "history.csv is damaged: delete it to go on"),

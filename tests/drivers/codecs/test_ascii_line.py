@@ -215,7 +215,7 @@ BAD_COLUMNS = [
     ("A0.fx*big", "columns[0]: scale must be a number other than 0, not 'big'"),
     ("count:99,A0.fx", "columns[0]: a counter must have 1 to 53 bits, not 99"),
     ("count,A0.fx,count", "columns: count appears twice"),
-    ("A0.fx:mN,A1.fx:mT", "columns: A1.fx is in T, another fx in N"),
+    ("A0.fx:mN,A1.fx:mT", "columns: A1.fx is in T, but another fx in N"),
     ("count,-", "columns: no column measures anything"),
     ("time*2:ms,A0.fx", "columns[0]: 'time*2:ms' is no column"),
 ]
@@ -256,9 +256,9 @@ def test_bad_files_are_named(tmp_path: Path, text: str, message: str) -> None:
 
 
 def test_other_mistakes_are_named() -> None:
-    with pytest.raises(ConfigError, match="give either mapping=FILE"):
+    with pytest.raises(ConfigError, match="needs either mapping=FILE"):
         AsciiLineOptions()
-    with pytest.raises(ConfigError, match="give either mapping=FILE"):
+    with pytest.raises(ConfigError, match="needs either mapping=FILE"):
         AsciiLineOptions(mapping="a.toml", columns="A0.fx")
     with pytest.raises(ConfigError, match="rate_hz must be positive, not -1"):
         AsciiLine(AsciiLineOptions(columns="A0.fx", rate_hz=-1.0))

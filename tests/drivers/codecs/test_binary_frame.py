@@ -195,8 +195,8 @@ def test_checksums_are_the_published_ones(name, check, tmp_path):
 
 
 MISTAKES = [
-    ("at = 21", "at = 20", r"byte 20 is of checksum and of values\[1\]"),
-    ("at = 17", "at = 21", r"byte 21 is of checksum and of values\[1\]"),
+    ("at = 21", "at = 20", r"byte 20 belongs to both checksum and values\[1\]"),
+    ("at = 17", "at = 21", r"byte 21 belongs to both checksum and values\[1\]"),
     ("length = 24", "length = 19", r"reaches byte \d+; a frame has 19"),
     ('"crc16_modbus"', '"crc17"', r"checksum 'crc17' is not known; there are sum8, .*crc32"),
     ('"A5 5A"', '"A5 5"', r"sync: write bytes in hexadecimal, AA 07, not 'A5 5'"),
@@ -228,7 +228,7 @@ def test_a_mistake_is_one_line_that_names_the_file_and_the_key(old, new, said, t
 
 
 def test_without_a_mapping_it_says_what_to_give():
-    with pytest.raises(ConfigError, match=r"give mapping=FILE.toml"):
+    with pytest.raises(ConfigError, match=r"needs mapping=FILE.toml"):
         BinaryFrameOptions()
 
 

@@ -494,7 +494,7 @@ def test_fakes_are_opened_by_their_url(fake_serial: Any, fake_can: Any) -> None:
             assert source.spec == SPEC
             assert np.array_equal(concatenate(read_chunks(source, 300)).values, values)
     assert bus_device.port == "virtual:mine" and slcan_device.port.startswith("slcan:/dev/pts/")
-    with pytest.raises(ConfigError, match="a signal is"):
+    with pytest.raises(ConfigError, match="a signal must be"):
         FakeSerial(np.zeros(3))
     with pytest.raises(ConfigError, match="no can codec 'nativ'"):
         FakeCan(values, "nativ")
