@@ -206,7 +206,7 @@ def test_a_set_is_replaced_on_demand_and_nothing_else_is(here, night, tmp_path, 
     assert "is not a set of recordings, and is not replaced" in err
     (out / "notes.txt").touch()
     err = refused("label", recording, out, "--force")
-    assert f"{out} holds 'notes.txt', too, and stays" in err
+    assert f"{out} holds 'notes.txt', too, and is not replaced" in err
     err = refused("label", recording, tmp_path / "no" / "set")
     assert "no folder" in err
 

@@ -107,7 +107,7 @@ def test_a_second_list_takes_nothing_away_of_the_first(shapes, tmp_path: Path, c
     second = listed(tmp_path / "second.csv", rows)
     code, out, err = call("objects", "get", second, tmp_path / "got", "--clones", clones)
     assert code == 1
-    assert "box/brick.ply is of some/shapes: choose another folder" in out + err
+    assert "box/brick.ply comes from some/shapes: choose another folder" in out + err
     both = open_objects(tmp_path / "got").origins
     assert first.items() <= both.items() and both.keys() - first.keys() == {"box/other"}
 
