@@ -275,7 +275,7 @@ def test_letters_and_numbers_are_orders(tmp_path):
         words = ("teach", url(line), tmp_path / "a", "--classes", "press,slide", "--touches", "9")
         done = run_program(*words, input="n\nrub\n7\nu\n1\nq\n")
     assert done.returncode == 2
-    assert "too few to learn from: two of a class are needed" in done.stderr
+    assert "too few to learn from: a class needs two touches" in done.stderr
     for said in ("touch it: slide (1 of 9)", "touch it: rub (1 of 9)",
                  "there is no class 7: there are 3", "there is no touch to take back"):  # fmt: skip
         assert said in done.stdout
