@@ -37,7 +37,7 @@ def walk_page(road: Road, wheel: Path) -> None:
     made_up = ["--set", "source.whiskers.url=synthetic:mouse"]
     road.step(
         "what is made up says so", "tactile-rt", "config", "check", "robot.toml", *made_up,
-        says=["what is decided on it means nothing"],
+        says=["decisions on it mean nothing"],
     )  # fmt: skip
 
 

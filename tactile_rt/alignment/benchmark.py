@@ -160,8 +160,8 @@ def load_strict(path: Path) -> Benchmark:
     benchmark = load_benchmark(path)
     if benchmark.protocol != "strict":
         raise ConfigError(
-            f"{path} is of protocol {benchmark.protocol}, whose stimuli stand in the order of "
-            "their first appearance, another in each session: build with protocol strict"
+            f"{path} was built with protocol {benchmark.protocol}, which orders the stimuli of "
+            "each session by first appearance: build it with protocol strict"
         )
     return benchmark
 
@@ -176,9 +176,9 @@ def check_benchmark(benchmark: Benchmark, path: Path) -> None:
         raise ConfigError(f"{path}: no protocol {benchmark.protocol!r}: {', '.join(PROTOCOLS)}")
     number = len(benchmark.stimuli)
     if not FEWEST <= number == len(set(benchmark.stimuli)) <= MOST:
-        raise ConfigError(f"{path}: stimuli need {FEWEST} to {MOST} names, each another")
+        raise ConfigError(f"{path}: stimuli need {FEWEST} to {MOST} different names")
     if {*benchmark.stimuli} == {*STIMULI} and benchmark.stimuli != STIMULI:
-        raise ConfigError(f"{path}: the six stimuli are in another order than {STIMULI}")
+        raise ConfigError(f"{path}: the six stimuli must be in the order {STIMULI}")
     pairs = len(upper_indices(number)[0])
     for target in benchmark.all_targets:
         if not target.chosen.rdm.shape == target.unfiltered.rdm.shape == (pairs,):
@@ -188,4 +188,4 @@ def check_benchmark(benchmark: Benchmark, path: Path) -> None:
     if a2a.animals != tuple(t.name for t in benchmark.targets) or not (
         a2a.pooled.shape == (animals,) and a2a.pairwise.shape == (animals, animals)
     ):
-        raise ConfigError(f"{path}: a2a and the targets are not of the same animals")
+        raise ConfigError(f"{path}: a2a and targets must have the same animals")

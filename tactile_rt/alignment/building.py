@@ -64,15 +64,15 @@ def build(
     if not inputs:
         raise ConfigError("name NWB files or a folder of them to build from")
     if bootstraps < 1:
-        raise ConfigError(f"{bootstraps} bootstraps: at least one")
+        raise ConfigError(f"bootstraps must be 1 or more, not {bootstraps}")
     strict = protocol == "strict"
     tables = [path for path in inputs if path.suffix == ".csv"]
     archives = [path for path in inputs if path.suffix == ".npz"]
     named = bool(tables) or any(map(has_named_stimuli, archives))
     if archives and len(inputs) > 1:
-        raise ConfigError(f"{archives[0]}: an .npz holds all animals: name nothing beside it")
+        raise ConfigError(f"{archives[0]}: an .npz holds all animals: give no other file")
     if named and (not strict or clock):
-        raise ConfigError(f"{inputs[0]}: named stimuli are for protocol strict, without a --clock")
+        raise ConfigError(f"{inputs[0]}: named stimuli need protocol strict and no --clock")
     if archives and strict and not named:
         raise ConfigError(
             f"{archives[0]}: its stimuli have no names, and trials that did not show a stimulus "

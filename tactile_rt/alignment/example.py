@@ -51,9 +51,9 @@ class Brain:
     def __post_init__(self) -> None:
         for name in ("mice", "sessions", "units", "trials"):
             if getattr(self, name) < 1:
-                raise ConfigError(f"{name}: at least 1, not {getattr(self, name)}")
+                raise ConfigError(f"{name} must be 1 or more, not {getattr(self, name)}")
         if not 0 <= self.private <= 1:
-            raise ConfigError(f"private: a share from 0 to 1, not {self.private}")
+            raise ConfigError(f"private must be from 0 to 1, not {self.private}")
 
     def geometry(self, rng: np.random.Generator) -> Floats:
         """Draw the shared geometry (6, feature): zero mean over stimuli, mean square one."""

@@ -64,9 +64,9 @@ def write_example(
     import h5py
 
     if seed < 0:
-        raise ConfigError(f"a seed is at least 0, not {seed}")
+        raise ConfigError(f"seed must be 0 or more, not {seed}")
     if folder.exists():
-        raise ConfigError(f"{folder} is there already: name a new folder")
+        raise ConfigError(f"{folder} already exists: name a new folder")
     truth, models, mice = (np.random.default_rng([seed, part]) for part in range(3))
     shared = brain.geometry(truth)
     folder.parent.mkdir(parents=True, exist_ok=True)

@@ -40,14 +40,14 @@ def read_json(path: Path, kind: type[T], made_by: str) -> T:
         raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise ConfigError(
-            f"{path} is damaged, or not of `{made_by}` of this release: {error}"
+            f"{path} is damaged, or was not made by `{made_by}` of this release: {error}"
         ) from None
 
 
 def _decode_numbers(kind: Any, value: Any) -> Any:
     numbers = np.array(value, dtype=np.float64)
     if (np.abs(numbers) > LARGEST).any():
-        raise ValueError(f"numbers are at most {LARGEST:g}")
+        raise ValueError(f"numbers must be at most {LARGEST:g}")
     if get_origin(kind) is np.ndarray:
         return numbers
     return kind(numbers)

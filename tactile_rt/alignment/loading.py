@@ -144,7 +144,7 @@ def load_untrained(path: Path, stimuli: StimuliInput, seed: int) -> Layers | Non
     if path.suffix == RESPONSES or _is_module(path) or _is_foreign(path):
         return None
     if seed < 0:
-        raise ConfigError(f"a seed is at least 0, not {seed}")
+        raise ConfigError(f"seed must be 0 or more, not {seed}")
     from tactile_rt.alignment.activations import untrained_card_layers, untrained_layers
 
     if path.suffix == CHECKPOINT:
@@ -211,7 +211,9 @@ def read_responses(path: Path, names: tuple[str, ...] = STIMULI) -> Layers:
                 full = name if dot and part in PARTS else f"encoder.{name}"
                 if full in traces:
                     short = full.removeprefix("encoder.")
-                    raise ConfigError(f"{path}: arrays {short} and {full} are one layer: name one")
+                    raise ConfigError(
+                        f"{path}: arrays {short} and {full} are the same layer: give one"
+                    )
                 array = array[order]
                 traces[full] = (array if array.ndim == 3 else array[:, None]).astype(np.float32)
     if not traces:

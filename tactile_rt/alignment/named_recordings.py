@@ -50,7 +50,7 @@ def read_named_npz(path: Path, selection: Selection | None = None) -> list[Neura
     with explain_errors(ConfigError, f"{path}: not an npz file of arrays (", most=80):
         with zipfile.ZipFile(path) as archive:
             if (size := sum(member.file_size for member in archive.infolist())) > LARGEST:
-                raise ValueError(f"it would be {size} bytes")
+                raise ValueError(f"it unpacks to {size} bytes")
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
     sessions: dict[tuple[str, str], dict[str, NDArray[Any]]] = defaultdict(dict)
@@ -106,7 +106,7 @@ def read_spike_tables(
             raise ConfigError(f"{tables[EVENTS]}:{number}: stop_s {stop:g} is not after start_s")
         shown[row["animal"], row["session"]].append((row["stimulus"], start, stop))
     if alone := sorted(map("/".join, spikes.keys() ^ shown.keys())):
-        raise ConfigError(f"{tables[EVENTS]}: spikes without events, or events without: {alone[0]}")
+        raise ConfigError(f"{tables[EVENTS]}: session {alone[0]} needs both spikes and events")
     sessions: dict[tuple[str, str], dict[str, NDArray[Any]]] = {}
     for key, events in shown.items():
         names, starts, stops = (np.array(column) for column in zip(*events, strict=True))
@@ -115,7 +115,7 @@ def read_spike_tables(
         rates = np.stack(counts, axis=1) / (stops - starts)[:, None]
         if not rates.any():
             raise ConfigError(
-                f"{tables[SPIKES]}: no spike of {'/'.join(key)} is within its events: are both "
+                f"{tables[SPIKES]}: no spike of {'/'.join(key)} falls within its events: are both "
                 "tables in s, on one clock?"
             )
         sessions[key] = {"rates": rates, "stimulus": names}
@@ -151,7 +151,7 @@ def _make_sessions(
             )
         )  # fmt: skip
     if not made:
-        raise ConfigError(f"{path}: no session is of {selection}")
+        raise ConfigError(f"{path}: no session matches: {selection}")
     return made
 
 

@@ -47,13 +47,14 @@ class NeuralSession:
         rates, stimulus = self.rates, self.stimulus
         if rates.ndim != 2 or stimulus.shape != rates.shape[:1]:
             raise ConfigError(
-                f"session {self.name}: rates {rates.shape} and stimuli {stimulus.shape} do not fit"
+                f"session {self.name}: {rates.shape} rates need a stimulus per trial, not "
+                f"{stimulus.shape}"
             )
         if not np.isfinite(rates).all():
             raise ConfigError(f"session {self.name}: a rate is not finite")
         if stimulus.dtype.kind not in "iu" or not np.isin(stimulus, range(len(self.stimuli))).all():
             raise ConfigError(
-                f"session {self.name}: a stimulus is a number from 0 to {len(self.stimuli) - 1}"
+                f"session {self.name}: stimuli must be numbers from 0 to {len(self.stimuli) - 1}"
             )
         trials, units = rates.shape
         for what, shape in (("depth", (units,)), ("inhibitory", (units,)), ("begin", (trials,))):
@@ -104,8 +105,8 @@ def published_layout(animal: Animal) -> Floats:
         missing = [name for name, n in zip(STIMULI, session.trials, strict=True) if not n]
         if missing:
             raise ConfigError(
-                f"session {session.name} has no correct trial of {name_some(missing)}: paper-code "
-                "cannot place it; leave the session out or build with protocol strict"
+                f"session {session.name} has no correct trial of {name_some(missing)}, which "
+                "protocol paper-code needs; leave it out, or use --protocol strict"
             )
         _, first = np.unique(session.stimulus, return_index=True)
         place = np.argsort(np.argsort(first))  # of each stimulus, by first appearance
@@ -154,7 +155,7 @@ def read_published(path: Path) -> dict[str, Floats]:
         with zipfile.ZipFile(path) as archive:
             size = sum(member.file_size for member in archive.infolist())
         if size > LARGEST:
-            raise ValueError(f"it would be {size} bytes")
+            raise ValueError(f"it unpacks to {size} bytes")
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files if name != NOT_AN_ANIMAL}
     except FileNotFoundError:

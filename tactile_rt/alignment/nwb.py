@@ -103,7 +103,9 @@ def read_nwb(
                 readings.append(reading)
         read(1.0)
     if not readings:
-        raise ConfigError(name_some(spoilt, 1) or f"no session of {len(every)} is of {chosen}")
+        raise ConfigError(
+            name_some(spoilt, 1) or f"none of {len(every)} sessions has units that match: {chosen}"
+        )
     notes = [*spoilt, *(note for reading in readings for note in reading.notes)]
     if str(chosen):
         units = sum(r.session.rates.shape[1] for r in readings)
@@ -207,7 +209,7 @@ def _assemble(
     spikes = [times - shift for times, keep in zip(units, chosen, strict=True) if keep]
     rates, course = _compute_rates(spikes, start[rows], stop[rows], progress)
     if rates.size and not rates.any():
-        raise ConfigError(f"none of {len(spikes)} units has a spike in one of {len(rows)} trials")
+        raise ConfigError(f"no spike of {len(spikes)} units falls within any of {len(rows)} trials")
     session = NeuralSession(
         animal=parts.animal_name(file, name),
         name=name,

@@ -81,8 +81,7 @@ def contact_times(file: "h5py.File", notes: list[str]) -> Floats:
         times.append(starts[good])
     if not sum(map(len, times)):
         raise ConfigError(
-            f"has no contacts (processing/*/{CONTACTS}*): without them only protocol paper-code "
-            "can use it"
+            f"has no contacts (processing/*/{CONTACTS}*): without them, use protocol paper-code"
         )
     return np.sort(np.concatenate(times))
 

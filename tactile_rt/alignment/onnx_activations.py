@@ -241,7 +241,9 @@ def _open_model(
     stimuli.check(card.array, card.steps, card.substeps, str(path), card.period_ns)
     model = onnx.load(path, load_external_data=False)
     if card.kind == "window" and step_graph(model)[1] is None:
-        raise ModelError(f"{path} is a window that is no Scan over a step: its layers are unknown")
+        raise ModelError(
+            f"{path} is a window model without a Scan over a step: its layers are unknown"
+        )
     return session, card, model
 
 

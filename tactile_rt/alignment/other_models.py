@@ -72,7 +72,7 @@ def other_onnx_layers(path: Path, stimuli: StimuliInput, input_name: str = "") -
         (input_name,) = inputs
     if input_name not in inputs:
         names = ", ".join(sorted(inputs))[:REASON]
-        raise ConfigError(f"{path}: say by --input which takes the loads, of {names}")
+        raise ConfigError(f"{path}: give --input, the input that takes the loads: {names}")
     given = inputs.pop(input_name)
     if given.type not in TYPES:
         raise ConfigError(f"{path}: input {input_name} is {given.type}, not of reals: {OTHERWISE}")

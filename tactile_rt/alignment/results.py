@@ -67,7 +67,10 @@ def score_model(
     untrained: Layers | None = None,
     performance: tuple[float, str] | None = None,
 ) -> ModelResult:
-    """Score a model and its untrained network; under strict, run the Turing test too."""
+    """Score a model and its untrained network.
+
+    Protocol strict adds the test against real animals ("Turing test").
+    """
     patterns = layers.patterns
     made = score(benchmark, patterns)
     # The test needs the stimuli's names, which paper-code does not have.
@@ -151,7 +154,7 @@ def baseline_of(path: Path, benchmark: Benchmark, stimuli: StimuliInput) -> Floa
     """
     results = read_results(path)
     if len(results.models) != 1:
-        raise ConfigError(f"{path} has {len(results.models)} models; a baseline is one")
+        raise ConfigError(f"{path} has {len(results.models)} models; a baseline must have one")
     if benchmark_sha256(results.benchmark) != benchmark_sha256(benchmark):
         raise ConfigError(f"{path} was scored on another benchmark: score the baseline on this one")
     if results.raw and results.input.get("sha256") != stimuli.sha256:

@@ -86,7 +86,7 @@ class StimuliInput:
 
 
 def read_stimuli(path: Path | None = None) -> StimuliInput:
-    """Read a file of `tactile-rt whisk`; without a path, this package's input."""
+    """Read the stimuli's loads that `tactile-rt whisk` wrote; without a path, the shipped file."""
     path = SHIPPED if path is None else path
     refuse_lfs_pointer(path)
     try:
@@ -102,7 +102,7 @@ def read_stimuli(path: Path | None = None) -> StimuliInput:
         if text.ndim != 1 or text.dtype.kind != "U":
             raise ConfigError(f"{path}: {what} are {text.dtype} {text.shape}, not a row of names")
         if what != "units" and len(set(text.tolist())) < len(text):
-            raise ConfigError(f"{path}: two {what} have one name")
+            raise ConfigError(f"{path}: two {what} have the same name")
     names = [str(n) for n in arrays["stimuli"]]
     missing = [n for n in STIMULI if n not in names]
     if missing:

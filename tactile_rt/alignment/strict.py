@@ -311,7 +311,7 @@ def _find_repeated(keys: Keys) -> NDArray[np.intp]:
 
 
 def _rank_rates(rates: NDArray[np.float64]) -> Keys:
-    """Return a hash of each rate's rank among all rates; equal rates share ranks."""
+    """Rank all rates together, ties sharing a rank; return one 64-bit hash per rate."""
     order = np.argsort(rates, axis=None)
     sorted_ = rates.ravel()[order]
     steps = np.diff(sorted_) > SAME * np.maximum(np.abs(sorted_[1:]), np.abs(sorted_[:-1]))

@@ -52,10 +52,10 @@ class Mirror:
     def __post_init__(self) -> None:
         for what in ("axis", "element_axis"):
             if getattr(self, what) not in AXES:
-                raise ConfigError(f"mirror.{what} is x, y or z, not {getattr(self, what)!r}")
+                raise ConfigError(f"mirror.{what} must be x, y or z, not {getattr(self, what)!r}")
         for channel, sign in self.signs.items():
             if sign not in (1, -1):
-                raise ConfigError(f"mirror.signs.{channel} is 1 or -1, not {sign}")
+                raise ConfigError(f"mirror.signs.{channel} must be 1 or -1, not {sign}")
 
     def sign(self, channel: str, unit: str) -> int:
         """Return the factor, 1 or -1, by which the reflection multiplies a channel.
@@ -152,17 +152,17 @@ class Calibration:
         outputs, inputs = len(channels), len(self.channels)
         for what, names in (("elements", self.elements), ("channels", self.channels)):
             if not names or len(set(names)) < len(names):
-                raise ConfigError(f"raw.{what}: name at least one, and none twice")
+                raise ConfigError(f"raw.{what}: must be one or more names, all different")
         if len(set(channels)) < outputs:
-            raise ConfigError("output.channels: none may be there twice")
+            raise ConfigError("output.channels: names must differ")
         _check_size("raw.units", self.units, inputs, "raw channels")
         _check_size("output.units", units, outputs, "output channels")
         if self.gain:
             _check_size("gain", self.gain, inputs, "raw channels")
             if outputs != inputs:
                 raise ConfigError(
-                    f"gain: makes {inputs} channels of {inputs}, but output.channels has {outputs};"
-                    f" give every element a matrix instead"
+                    f"gain: makes {inputs} channels from {inputs}, but output.channels has "
+                    f"{outputs}; give every element a matrix instead"
                 )
             _check_finite("gain", self.gain)
         for what, rows in (("tare", self.tare), ("noise", self.noise)):

@@ -28,8 +28,8 @@ def read_array(path: Path) -> ArraySpec:
     text = read_text(path)
     if path.suffix == ".toml":
         raise ConfigError(
-            f"{path}: not JSON: of whiskers to be simulated, `tactile-rt describe sim:{path} --out "
-            f"{path.stem}.json` writes the array"
+            f"{path} is TOML; an array must be JSON: make it with `tactile-rt describe sim:{path} "
+            f"--out {path.stem}.json`"
         )
     try:
         return ArraySpec.from_json(text)

@@ -216,11 +216,11 @@ class Classifier:
         fuse_s: float = 0.0,
     ) -> None:
         if mode not in get_args(Mode):
-            raise ConfigError(f"mode: {mode!r}; it can be {', '.join(get_args(Mode))}")
+            raise ConfigError(f"mode must be one of {', '.join(get_args(Mode))}, not {mode!r}")
         if mode == "sliding" and sure is not None:
-            raise ConfigError("sure: windows that slide have no early end; decide by episodes")
+            raise ConfigError("sure needs mode episode: sliding windows have no early end")
         if fuse_s < 0:
-            raise ConfigError(f"fuse_s: {fuse_s} s; it must be 0 or more")
+            raise ConfigError(f"fuse_s must be 0 or more, not {fuse_s} s")
         self._exit = EarlyExit(sure, in_a_row)
         names = onnxruntime_names(providers)
         session, self.card = load_model(model, names)
@@ -238,7 +238,9 @@ class Classifier:
         step_s = self.card.substeps * self.card.period_ns / NS_PER_S
         self._deadline = Deadline(step_s if deadline_s is None else deadline_s, late, age)
         if catch_up not in get_args(CatchUp):
-            raise ConfigError(f"catch_up: {catch_up!r}; it can be {', '.join(get_args(CatchUp))}")
+            raise ConfigError(
+                f"catch_up must be one of {', '.join(get_args(CatchUp))}, not {catch_up!r}"
+            )
         most_s = max(BEHIND_S, BEHIND_STEPS * step_s) if behind_s is None else behind_s
         self.skips = Skips(skips, most_s, age if catch_up == "newest" else None)
         self._stepper = Stepper(session, self.card, self._lanes.count)

@@ -146,9 +146,9 @@ class EarlyExit:
 
     def __init__(self, sure: float | None, in_a_row: int = IN_A_ROW) -> None:
         if sure is not None and not 0 < sure <= 1:
-            raise ConfigError(f"sure: {sure} is no probability above 0")
+            raise ConfigError(f"sure must be above 0, at most 1, not {sure}")
         if in_a_row < 1:
-            raise ConfigError(f"in_a_row: {in_a_row} steps; it must be at least 1")
+            raise ConfigError(f"in_a_row must be at least 1 step, not {in_a_row}")
         self._sure, self._in_a_row = np.inf if sure is None else sure, in_a_row
         self._best, self._sure_for = -1, 0
 
@@ -237,9 +237,9 @@ class Deadline:
         age: Callable[[int], float] | None = None,
     ) -> None:
         if policy not in get_args(Policy):
-            raise ConfigError(f"late: {policy!r}; it can be {', '.join(get_args(Policy))}")
+            raise ConfigError(f"late must be one of {', '.join(get_args(Policy))}, not {policy!r}")
         if not limit_s > 0:
-            raise ConfigError(f"deadline_s: {limit_s}; it must be positive")
+            raise ConfigError(f"deadline_s must be positive, not {limit_s}")
         self.limit_s, self.policy, self._age = limit_s, policy, age
         self.behind_s = 0.0
         self.late = 0
@@ -267,8 +267,9 @@ class Deadline:
         if self.policy == "report" and not self._reported:
             self._reported = True
             log.warning(
-                "late: a step took %.1f ms, %.1f ms of work have gathered, its newest sample is "
-                "%.1f ms old (limit %.1f ms); %d late steps so far",
-                1e3 * took_s, 1e3 * self.behind_s, 1e3 * age, 1e3 * self.limit_s, self.late,
+                "late: step took %.1f ms, backlog %.1f ms%s (limit %.1f ms); %d late steps so far",
+                1e3 * took_s, 1e3 * self.behind_s,
+                "" if self._age is None else f", newest sample {1e3 * age:.1f} ms old",
+                1e3 * self.limit_s, self.late,
             )  # fmt: skip
         return True

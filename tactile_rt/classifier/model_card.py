@@ -240,33 +240,35 @@ def parse_card(path: Path, text: str) -> ModelCard:
     if len(set(names)) != len(names):
         raise reject("names of the state repeat")
     if card.kind == "window" and card.state:
-        raise reject("a window has no state")
+        raise reject("kind is window, but state is declared; only step models have state")
     shapes = {s.name: s.shape for s in card.state}
     window = (card.steps,) if card.kind == "window" else ()
     shapes["samples"] = (*window, card.substeps, elements, channels)
     for name, shape in shapes.items():
         # Python's integers, since a product of int64 may overflow to a small number.
         if min(shape, default=1) < 1 or math.prod(shape) > MAX_ELEMENTS:
-            raise reject(f"{name[:40]} of shape {'x'.join(map(str, shape))[:80]}")
+            raise reject(f"{name[:40]} has the shape {'x'.join(map(str, shape))[:80]}")
     episode = card.steps * card.substeps * elements * channels
     if episode > MAX_EPISODE:
-        raise reject(f"an episode of {episode} values")
+        raise reject(f"an episode has {episode} values, more than {MAX_EPISODE}")
     if sum(math.prod(shape) for shape in shapes.values()) > MAX_ELEMENTS:
         raise reject("its state is larger than any robot's memory should hold")
     for state in card.state:
         if state.dtype not in STATE_TYPES:
-            raise reject(f"{state.name[:40]} of type {state.dtype[:40]!r}")
+            raise reject(f"state {state.name[:40]} has the type {state.dtype[:40]!r}")
     if card.probe and [len(row) for row in card.probe] != [len(card.labels)] * card.steps:
-        raise reject(f"the probe is not {card.steps} steps of {len(card.labels)} logits")
+        raise reject(f"the probe must be {card.steps} steps of {len(card.labels)} logits")
     if card.embedding < 1:
-        raise reject(f"an embedding of {card.embedding} units")
+        raise reject(f"embedding must be 1 or more, not {card.embedding}")
     for name, kinds in card.kinds.items():
         if name not in card.classes or not kinds or len(set(kinds)) != len(kinds):
-            raise reject(f"kinds of {name[:MAX_NAME]!r}: it is no class, or they repeat")
+            raise reject(
+                f"kinds of {name[:MAX_NAME]!r}: no such class, or its kinds are missing or repeat"
+            )
         if not all(map(is_printable_name, kinds)):
             raise reject(f"kinds must be 1 to {MAX_NAME} printable characters")
     if not card.names.keys() <= card.kinds.keys():
-        raise reject("names have rules of a class without kinds")
+        raise reject("names has rules for a class without kinds")
     rules = {f"candidates[{i}]": rule for i, rule in enumerate(card.candidates)}
     for name, own in card.names.items():
         rules |= {f"names.{name[:MAX_NAME]}[{i}]": rule for i, rule in enumerate(own)}
@@ -274,9 +276,9 @@ def parse_card(path: Path, text: str) -> ModelCard:
         if rule is not None and (wrong := rule.fault(card.steps)):
             raise reject(f"{what}.{wrong}")
     if card.refusals != card.labels[len(card.labels) - len(card.refusals) :]:
-        raise reject("refusals are not the last of the labels")
+        raise reject("refusals must be the last entries of labels, in the same order")
     if len(card.refusals) == len(card.labels):
-        raise reject("there are no labels but refusals")
+        raise reject("all labels are refusals")
     if wrong := enrolment_fault(card.identity, card.enrolled, card.embedding):
         raise reject(wrong)
     return card

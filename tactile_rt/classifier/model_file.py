@@ -205,7 +205,7 @@ def check_graph(
         raise _make_input_error(path, sorted(wrong))
     batches = {shape[0] for shape, _ in inputs.values()}
     if any(isinstance(batch, int) and batch != 1 for batch in batches):
-        raise ModelError(f"{path}: the graph's batch size is fixed to another than 1")
+        raise ModelError(f"{path}: the graph's batch size is fixed, but not to 1")
     for name, size in output_sizes(card).items():
         shape, kind = outputs.get(name, ((), ""))
         if shape[-1:] != (size,) or len(shape) != 2 + window or kind != "tensor(float)":
@@ -323,7 +323,7 @@ def verify_model(path: Path) -> list[str]:
     if stored := card.hashes.get("graph"):
         found = graph_sha256(read_model(path)[2])
         if found != stored:
-            raise ModelError(f"{path}: the graph is another than was exported: sha256 {found}")
+            raise ModelError(f"{path}: the graph is not the exported one: sha256 {found}")
         lines.append(f"graph: as it was exported, sha256 {found}")
     else:
         lines.append("graph: the file stores no hash of it")
@@ -332,14 +332,14 @@ def verify_model(path: Path) -> list[str]:
     if bad := [name for name, values in outputs.items() if not np.isfinite(values).all()]:
         raise ModelError(f"{path}: the probe episode gives `{bad[0]}` that is not finite")
     if not _are_equal(outputs, file_outputs(session, card, samples, offset, sigma)):
-        raise ModelError(f"{path}: the probe episode gives other logits when run again")
+        raise ModelError(f"{path}: the probe episode gives different logits when run again")
     lines.append(f"probe: {card.steps} finite steps, the same again after a reset")
     lines.append(f"embedding: {card.embedding} units, finite")
     samples[:, 0] = offset[:, None]
     at_rest = file_outputs(session, card, samples, offset, sigma)
     samples[:, 0] = np.resize((np.nan, np.inf, -np.inf), samples[:, 0].shape)
     if not _are_equal(file_outputs(session, card, samples, offset, sigma), at_rest):
-        raise ModelError(f"{path}: a sample that is no number is not taken for no load")
+        raise ModelError(f"{path}: an invalid (NaN) sample must count as no load")
     lines.append("bad samples: NaN and infinity are no load")
     if not card.probe:
         return [*lines, "parity: the file stores no logits to compare with"]

@@ -197,11 +197,11 @@ class _Walk:
                     raise BadModel(f"more than {MAX_METADATA} bytes of metadata")
                 self.metadata(at, end)
             else:
-                raise BadModel(f"has a {what} of its own, which we do not run")
+                raise BadModel(f"it contains an ONNX {what} section, which is not supported")
         if graphs != 1:
             raise BadModel("no graph in it" if not graphs else "more than one graph")
         if len(self.found.opset.keys() & {"", "ai.onnx"}) != 1:
-            raise BadModel("it does not say, once, which version of ONNX's operators it uses")
+            raise BadModel("it must state exactly one version of ONNX's operators")
         for operator, name in self.asked:
             if self.sizes.get(name, 0) > MAX_ELEMENTS:
                 raise BadModel(f"{operator} asks for {self.sizes[name]} elements")
@@ -224,7 +224,7 @@ class _Walk:
                 operator, inputs, outputs = self.nodes[i]
                 first, value = SHAPED_BY.get(operator, len(inputs)), VALUE_AT.get(operator)
                 if any(n in live for k, n in enumerate(inputs) if k >= first and k != value):
-                    raise BadModel(f"operator {operator!r} makes a shape of what is measured")
+                    raise BadModel(f"operator {operator!r} computes a shape from measured values")
                 new = set(outputs) - live
                 live |= new
                 waiting += new
@@ -237,7 +237,7 @@ class _Walk:
             elif (number, wire) == (2, VARINT):
                 version = value
         if domain in self.found.opset or not 0 < version <= MAX_OPSET:
-            raise BadModel(f"opset {version} of {domain[:40] or 'ai.onnx'!r}")
+            raise BadModel(f"opset {version} of {domain[:40] or 'ai.onnx'!r} is not supported")
         self.found.opset[domain] = version
 
     def metadata(self, at: int, end: int) -> None:
@@ -245,7 +245,7 @@ class _Walk:
         for what, start, stop in self.messages(at, end, key=1, value=2):
             pair[what] = self.text(start, stop)
         if pair["key"] in self.found.metadata:
-            raise BadModel(f"metadata {pair['key'][:40]!r} twice")
+            raise BadModel(f"metadata key {pair['key'][:40]!r} appears twice")
         self.found.metadata[pair["key"]] = pair["value"]
 
     def graph(self, at: int, end: int, depth: int) -> tuple[list[str], list[str]]:
@@ -289,7 +289,7 @@ class _Walk:
         if domain not in ("", "ai.onnx") and not (
             domain == "com.microsoft" and operator in MICROSOFT
         ):
-            raise BadModel(f"operator {operator[:40]!r} of {domain[:40]!r}, which we do not run")
+            raise BadModel(f"operator {operator[:40]!r} of {domain[:40]!r} is not supported")
         if operator == "Loop":
             raise BadModel("operator 'Loop', which may never end")
         self.found.operators[operator] += 1
@@ -344,10 +344,10 @@ class _Walk:
             elif number == 9:
                 raw = (value, stop)
             elif number == 13 or (number == 14 and (wire != VARINT or value)):
-                raise BadModel(f"tensor {name[:40]!r} is in another file, which we do not open")
+                raise BadModel(f"tensor {name[:40]!r} is in another file, which is not supported")
         elements = math.prod(dims)  # a negative dimension reads as a huge number
         if elements > MAX_ELEMENTS:
-            raise BadModel(f"tensor {name[:40]!r} of {elements} elements")
+            raise BadModel(f"tensor {name[:40]!r} has {elements} elements, which is too many")
         if raw is None:
             short = elements > 2 * (end - at)  # 4-bit numbers are the smallest
         else:
@@ -393,5 +393,5 @@ class _Walk:
                                 self.text(start, stop)  # a symbolic name, which onnxruntime keeps
                         elements *= max(sizes, default=1)
         if elements > MAX_ELEMENTS:
-            raise BadModel(f"a value of {elements} elements")
+            raise BadModel(f"a value has {elements} elements, which is too many")
         return name

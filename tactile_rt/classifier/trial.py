@@ -194,7 +194,7 @@ def _run_task(task: _Task) -> Trial:
             logits = stepper.run()
             took.append(time.monotonic() - start)
             if decides and not np.isfinite(logits).all():
-                raise ModelError(f"{path} is refused: its answer to {name} is no number")
+                raise ModelError(f"{path} is refused: its logits for {name} are not finite")
         step_s = max(step_s, float(np.median(took)))
     return Trial(sha256, load_s, step_s, (_read_data_bytes() - before) / MB)
 
@@ -262,7 +262,7 @@ def _main() -> int:
 
 
 def _rewrite_error(text: str, task: _Task) -> str:
-    """Shorten an error text, or explain the limit if onnxruntime lacked memory."""
+    """Shorten a failed trial's error; if memory ran out, name the memory limit instead."""
     if any(word in text for word in WANTED_MEMORY):
         return f"{task.path} is refused: {_explain_memory(task.limits)}"
     return text[:MESSAGE]

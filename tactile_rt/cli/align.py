@@ -67,7 +67,8 @@ def build_benchmark(
     ] = None,
     cells: Annotated[str | None, option("Only excitatory or inhibitory units.")] = None,
     clock: Annotated[
-        str | None, option("Clock of the spike times: session or recording (see the docs).")
+        str | None,
+        option("Zero of the spike times: session (as in NWB) or recording (as published)."),
     ] = None,
     bootstraps: Annotated[int, option("Number of random splits of the trials.")] = 1000,
     seed: Seed = 1234,
@@ -200,7 +201,7 @@ def decode_stimuli(
         felt = read_stimuli(stimuli)
         frozen = load_strict(benchmark) if benchmark else None
         if frozen and frozen.stimuli != STIMULI:
-            raise ConfigError(f"{benchmark}: shape and distance are those of the six stimuli alone")
+            raise ConfigError(f"{benchmark}: shape and distance exist only for the six stimuli")
         targets = frozen.targets if frozen else ()
         recorded, notes = animal_means(animals) if animals else ({}, [])
         names = check_models(models)

@@ -59,7 +59,7 @@ def fetch_recordings(
     selection = Selection(sessions=tuple(sessions or ()))
     files = [file for file in every if selection.takes(file.name)]
     if not files:
-        raise ConfigError(f"no session of {len(every)} is of {selection}: --list names them")
+        raise ConfigError(f"none of {len(every)} sessions matches {selection}: --list names them")
     if listed:
         if not told_as_json(files, json):
             for file in files:
@@ -91,7 +91,7 @@ def write_board(
         list[Path] | None, argument("Checkpoints (best.pt), .onnx files, and responses (.npz).")
     ] = None,
     data: Annotated[
-        list[str] | None, option("Recordings, NAME=PATH, e.g. 000231=FOLDER; may be repeated.")
+        list[str] | None, option("Recordings, DATASET=PATH, e.g. 000231=FOLDER; may be repeated.")
     ] = None,
     metric: Annotated[list[str] | None, option("Metric; may be repeated. Default: all.")] = None,
     part: Annotated[
@@ -109,7 +109,7 @@ def write_board(
     """
     check_output(page)
     if not data:
-        raise ConfigError("name recordings: --data NAME=PATH, see `tactile-rt align datasets`")
+        raise ConfigError("name recordings: --data DATASET=PATH, see `tactile-rt align datasets`")
     parts, models = list(dict.fromkeys(part or ["all"])), models or []
     with needing("train"):
         from tactile_rt.alignment.board import compute_board, join_boards
@@ -141,7 +141,7 @@ def write_board(
                 names = read.animals[0].sessions[0].stimuli
                 if names != (first := first or names):
                     raise ConfigError(
-                        f"{path} is of other stimuli than {sources[0][1]}: a board each"
+                        f"{path} has other stimuli than {sources[0][1]}: make a board for each"
                     )
                 rows = _make_rows(files, read.stimuli or felt, seed, update, names)
             with share_bar(f"scoring on {dataset.name}") as tell:
@@ -188,7 +188,7 @@ def _make_rows(
 def _parse_data(text: str) -> tuple[str, Path]:
     name, equals, path = text.partition("=")
     if not equals or not name or not path:
-        raise ConfigError(f"--data is NAME=PATH, not {text!r}")
+        raise ConfigError(f"--data must be DATASET=PATH, not {text!r}")
     return name, Path(path)
 
 

@@ -167,7 +167,7 @@ def check_text(*names: Path | None) -> None:
         try:
             str(name).encode()
         except UnicodeEncodeError:
-            raise ConfigError(f"{str(name)!r} is no UTF-8: rename it") from None
+            raise ConfigError(f"{str(name)!r} is not UTF-8: rename it") from None
 
 
 def check_named_once(file: Path) -> None:
@@ -186,7 +186,9 @@ def _list_files(word: str) -> set[Path]:
 def check_is_mcap(file: Path) -> None:
     """Refuse a recording's name that does not end in ``.mcap``."""
     if file.suffix != ".mcap":
-        raise ConfigError(f"{file}: a recording is a .mcap; `tactile-rt convert` makes others")
+        raise ConfigError(
+            f"{file}: a recording must end in .mcap; `tactile-rt convert` makes other formats"
+        )
 
 
 def check_new(file: Path, force: bool) -> None:
@@ -200,7 +202,7 @@ def check_new(file: Path, force: bool) -> None:
     if not file.exists():
         return
     if not force:
-        raise ConfigError(f"{file} is there already: name another file, or give --force")
+        raise ConfigError(f"{file} already exists: name another file, or give --force")
     check_named_once(file)
     from tactile_rt.recording.writer import check_not_recorded
 

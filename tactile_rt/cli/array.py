@@ -91,10 +91,10 @@ def fit(
     if out is not None:
         write_whole(out, lambda file: file.write(fitted.text.encode()))
         values = sum(len(f.edits) for f in fitted.findings)
-        typer.echo(f"{out}: {values} values brought to what was measured", err=json == STDOUT)
+        typer.echo(f"{out}: {values} values set to the measured ones", err=json == STDOUT)
     else:
         typer.echo(
-            "not written: --out FILE takes what was measured, also the array's own",
+            "not written: give --out FILE to save them; the array's own file is allowed",
             err=json == STDOUT,
         )
 

@@ -61,7 +61,7 @@ def bench(
     if show_records(records, json):
         return
     bars = [r for r in records if r.bar]
-    typer.echo(f"{sum(bool(r.met) for r in bars)} of {len(bars)} bars met")
+    typer.echo(f"{sum(bool(r.met) for r in bars)} of {len(bars)} requirements met")
 
 
 def _load_rig(area: str, module: str = "area") -> Any:

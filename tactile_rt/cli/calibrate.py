@@ -23,16 +23,15 @@ if TYPE_CHECKING:
 
 LOUDER = 3.0  # times the noise of the last tare: more prints a warning
 
-Out = Annotated[Path | None, option("TOML file to write or update. Default: the device's own.")]
-Device = Annotated[str, option("Id of the device. Default: the id that it reports.")]
-
 
 @app.command(epilog="tactile-rt tare 'serial:///dev/ttyUSB0?codec=bota'")
 def tare(
     source: Url,
     seconds: Annotated[float, option("How long to read, s.", min=0.01, max=3600)] = 2.0,
-    device: Device = "",
-    out: Out = None,
+    device: Annotated[str, option("Id of the device. Default: the id that it reports.")] = "",
+    out: Annotated[
+        Path | None, option("TOML file to write or update. Default: the device's own.")
+    ] = None,
     json: Json = None,
 ) -> None:
     """Measure the zero of an untouched sensor and store it.
@@ -72,7 +71,7 @@ def tare(
     if not told_as_json(results, json):
         _show_tare(measured)
     if untared:
-        typer.echo(f"not tared, for want of valid samples: {', '.join(measured.untared)}", err=True)
+        typer.echo(f"not tared, too few valid samples: {', '.join(measured.untared)}", err=True)
     if louder:
         typer.echo(
             f"more than {LOUDER:g} times as noisy as when last tared: {', '.join(louder)}; did "
@@ -88,8 +87,10 @@ def calibrate(
     table: Annotated[Path, argument("CSV file: loads fx..mz, and raw_... or start_s,end_s.")],
     element: Annotated[str, option("Element that was loaded. Default: the only one.")] = "",
     source: Annotated[str, option("URL of the recording that start_s and end_s refer to.")] = "",
-    device: Device = "",
-    out: Out = None,
+    device: Annotated[str, option("Id of the device whose file to update.")] = "",
+    out: Annotated[
+        Path | None, option("TOML file to write or update. Default: the file of --device.")
+    ] = None,
     json: Json = None,
 ) -> None:
     """Fit an element's calibration matrix to known loads.
@@ -113,7 +114,7 @@ def calibrate(
         recorded, spec = _read_samples(table, loads, source)
         fresh = Calibration.of(device or (path.stem if path else "unnamed"), spec)
     elif source:
-        raise ConfigError(f"{table} has readings of its own: leave out --source")
+        raise ConfigError(f"{table} has readings: leave out --source")
     else:
         fresh = Calibration(
             device or (path.stem if path else "unnamed"),

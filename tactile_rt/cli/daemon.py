@@ -90,7 +90,7 @@ def run(
         except SpecMismatch as error:
             raise SpecMismatch(f"{source}: {error}") from None
         if is_made_up(source):
-            typer.echo(f"{source} is made up: what is decided on it means nothing", err=True)
+            typer.echo(f"{source} is made up: decisions on it mean nothing", err=True)
         session, card = Session(opened, classifier), classifier.card
         stuck_at, stuck = StuckAtDetector(opened.spec.rate_hz), tuple[int, ...]()
         if device_of(opened) is not None:
@@ -104,9 +104,7 @@ def run(
                 found = all_of_them if stuck_at.seconds else stuck_at.elements
                 if set(found) - set(stuck):
                     names = name_some([opened.spec.elements[k] for k in found])
-                    typer.echo(
-                        f"no value of {names} changes: it hangs, or is out of range", err=True
-                    )
+                    typer.echo(f"no value of {names} changes: stuck, or out of range", err=True)
                 stuck = found
                 for d in decisions:
                     if final_only and not d.final:
@@ -178,7 +176,7 @@ def check(file: File, sets: Settings = None) -> None:
     typer.echo(f"{file}: {', '.join([*counts, *tables])}: all right")
     for source in found.source:
         if found.model and is_made_up(source.url):
-            typer.echo(f"source {source.name} is made up: what is decided on it means nothing")
+            typer.echo(f"source {source.name} is made up: decisions on it mean nothing")
 
 
 @config.command(epilog="tactile-rt config show robot.toml --set page.port=9000")
@@ -224,7 +222,7 @@ def ros2_messages(
     if not folder.is_dir():
         raise ConfigError(f"no folder {folder}")
     if made.exists():
-        raise ConfigError(f"{made} is there already")
+        raise ConfigError(f"{made} already exists")
     with replace_folder(made) as unfinished:
         shutil.copytree(PACKAGE, unfinished, dirs_exist_ok=True)
     typer.echo(f"{made} is written; build it with: colcon build --packages-select {PACKAGE.name}")
@@ -237,7 +235,7 @@ def _print_or_write(text: str, output: Path | None, then: str) -> None:
         typer.echo(text, nl=False)
         return
     if output.exists():
-        raise ConfigError(f"{output} is there already: name another file")
+        raise ConfigError(f"{output} already exists: name another file")
     _write(output, text)
     typer.echo(f"{output} is written; {then}")
 
@@ -270,7 +268,7 @@ def install_service(
         raise ConfigError(f"--user {user!r} is not a name that a user can have")
     check_folders(loaded, user)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise ConfigError(f"{out} is there already: name a new folder with --out")
+        raise ConfigError(f"{out} already exists: name a new folder with --out")
     program, path = _find_program(), str(file.absolute())
     unit = unit_text([*program, "run", path], loaded.config, user)
     again = [*program, "install-service", path, "--user", user]

@@ -86,7 +86,7 @@ def emulate(
     if wire not in ("serial", "slcan", "can"):
         raise ConfigError(f"--wire must be serial, slcan or can, not {wire!r}")
     if (wire == "can") != (bus is not None):
-        raise ConfigError("--wire can needs --bus INTERFACE:CHANNEL, and only it takes one")
+        raise ConfigError("--bus INTERFACE:CHANNEL goes with --wire can: give both or neither")
     if bus is not None and link is not None:
         raise ConfigError("--link names a port; a --bus has none")
     speed = "baud" if wire == "serial" else "bitrate"  # of the line, unless the codec has it, too
@@ -133,7 +133,7 @@ def codec_options(given: list[str]) -> dict[str, str]:
     for pair in given:
         name, equals, value = pair.partition("=")
         if not equals or not name:
-            raise ConfigError(f"--set {pair}: an option is KEY=VALUE")
+            raise ConfigError(f"--set {pair}: an option must be KEY=VALUE")
         if name in fields:
             raise ConfigError(f"--set {name}=... is given twice")
         fields[name] = value
@@ -174,7 +174,7 @@ def hil(
     sets: Annotated[list[str] | None, set_option("An option of the codec: format=int16")] = None,
     faults: Faults = None,
     sweeps: Annotated[
-        int | None, option(f"Objects that pass, with sim:. Default: {SWEEPS}.", min=1)
+        int | None, option(f"Objects to sweep past, for a sim: source. Default: {SWEEPS}.", min=1)
     ] = None,
     seconds: Annotated[
         float | None, option("Stop after this many seconds of the stream.", min=0.001, max=1e9)
@@ -213,7 +213,7 @@ def hil(
         if sweeps is not None or seconds is None:
             source = _add_option(source, "sweeps", str(sweeps or SWEEPS))
     elif sweeps is not None:
-        raise ConfigError("--sweeps is of a sim: source; of others give --seconds")
+        raise ConfigError("--sweeps needs a sim: source; for others give --seconds")
     opened = open_url(source)
     try:
         loop = Loop(opened, file, wire, codec, fields, schedule, seconds)
@@ -230,7 +230,7 @@ def hil(
     if not told_as_json(results, json):
         print_table(_make_table(report, source, f"{codec} over {wire}"))
     if not loop.complete:
-        typer.echo("interrupted: what was on its way is missing above", err=True)
+        typer.echo("interrupted: samples still in transit are not counted above", err=True)
         raise typer.Exit(INTERRUPTED)
     if report.failure:
         typer.secho(f"tactile-rt: {report.failure}", err=True, fg="red")

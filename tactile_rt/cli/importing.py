@@ -39,7 +39,9 @@ def import_file(
     topic: Annotated[str, option("Topic to read from a bag.")] = "",
     rate: Annotated[float, option("Samples per second, if the log has no times.", min=0)] = 0,
     bus: Annotated[str, option("Bus to read from a log of several, e.g. can0.")] = "",
-    form: Annotated[str, option("Format of the log, if it is detected wrongly.")] = "",
+    form: Annotated[
+        str, option("Format, if detected wrongly: raw, hex, terminal, candump, asc, blf, ...")
+    ] = "",
     delimiter: Annotated[str, option("Column delimiter: character, tab or space.")] = "",
     decimal: Annotated[str, option("Decimal mark of a table: a comma or a point.")] = "",
     skip: Annotated[int, option("Lines of a table to skip.", min=0)] = 0,
@@ -76,7 +78,7 @@ def import_file(
         with needing("view"):  # before anything is read
             import matplotlib  # noqa: F401
     if decimal not in ("", ",", "."):
-        raise ConfigError(f"--decimal is , or ., not {decimal!r}")
+        raise ConfigError(f"--decimal must be , or ., not {decimal!r}")
     with ExitStack() as stack:
         target = output
         if strict:  # hidden until it is known to be in order
@@ -94,7 +96,7 @@ def import_file(
             if is_bag(log):
                 if decoded_as:
                     raise ConfigError(
-                        f"{log} is a bag: its messages are no bytes of a codec; no --as"
+                        f"{log} is a bag: its messages are not bytes of a codec; leave out --as"
                     )
                 made = import_bag(log, target, topic, columns, rate)
             elif decoded_as and columns:
@@ -118,7 +120,7 @@ def import_file(
         for note in made.notes:
             typer.echo(f"{log}: {note}", err=True)
         if strict and odd:
-            raise ConfigError(f"{log}: {odd[0]:.100}; nothing is written, as --strict wants it")
+            raise ConfigError(f"{log}: {odd[0]:.100}; nothing is written (--strict)")
         if plot is not None:
             draw_import(target, made, odd, plot)
         if strict:

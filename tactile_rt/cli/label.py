@@ -107,7 +107,7 @@ def _parse_shares(text: str) -> tuple[float, ...]:
         shares = tuple(map(float, text.split(",")))
     except ValueError:
         raise ConfigError(
-            f"--shares is TRAIN,VALIDATION,TEST, as 0.7,0.15,0.15, not {text!r}"
+            f"--shares must be TRAIN,VALIDATION,TEST, as 0.7,0.15,0.15, not {text!r}"
         ) from None
     check_shares(shares)
     return shares
@@ -123,13 +123,17 @@ def _check_out(folder: Path, force: bool) -> None:
     if not folder.exists() or (folder.is_dir() and not any(folder.iterdir())):
         return
     if not force:
-        raise ConfigError(f"{folder} is there already: name another folder, or give --force")
+        raise ConfigError(f"{folder} already exists: name another folder, or give --force")
     try:
         manifest = SweepManifest.read(folder)
     except RecordingError:
         manifest = None
     if manifest is None or not manifest.recorded:
-        raise ConfigError(f"{folder} is no set of recordings, and stays: name another folder")
+        raise ConfigError(
+            f"{folder} is not a set of recordings, and is not replaced: name another folder"
+        )
     own = {MANIFEST, SUMS, *(object_path(folder, name).name for name in manifest.names())}
     if others := sorted({path.name for path in folder.iterdir()} - own):
-        raise ConfigError(f"{folder} holds {others[0]!r}, too, and stays: name another folder")
+        raise ConfigError(
+            f"{folder} holds {others[0]!r}, too, and is not replaced: name another folder"
+        )

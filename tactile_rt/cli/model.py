@@ -130,7 +130,7 @@ def bench(
 
     card, _, _ = read_model(file)
     if card.kind != "step":
-        raise ModelError(f"{file} is a model of kind {card.kind!r}: only steps are timed")
+        raise ModelError(f"{file} is a {card.kind} model: only step models are timed")
     with progress_bar("measuring"):
         records = measure_model(Subject("model", file), steps)
     show_records(records, json)
@@ -164,7 +164,7 @@ def _format_pairs(values: dict[str, Any]) -> str:
 @app.command("eval", epilog="tactile-rt eval model.onnx sweeps --pictures pictures")
 def evaluate(
     model: File,
-    data: Annotated[Path, argument("A sweep set.")],
+    data: Annotated[Path, argument("Sweep set; its test objects are used.")],
     svm: Annotated[bool, option("Also fit an RBF SVM on the same windows.", "--svm")] = False,
     pictures: Annotated[
         Path | None, option("Folder for pictures of confusion and accuracy over time.")

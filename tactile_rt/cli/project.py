@@ -40,7 +40,8 @@ def make(
         float, option("Time for all steps; less time makes a smaller model.")
     ] = 60.0,
     preview: Annotated[
-        bool, option("Only try a minute of sweeps, and draw FOLDER/preview.png.", "--preview")
+        bool,
+        option("Only simulate a few sweeps of each kind; draw FOLDER/preview.png.", "--preview"),
     ] = False,
     json: Json = None,
 ) -> None:

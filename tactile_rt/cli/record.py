@@ -96,7 +96,7 @@ def _parse_notes(given: list[str]) -> dict[str, str]:
     for pair in given:
         name, equals, value = pair.partition("=")
         if not equals or not name or name == "crc32":
-            raise ConfigError(f"--note is NAME=VALUE, not {pair!r}")
+            raise ConfigError(f"--note must be NAME=VALUE, not {pair!r}")
         notes[name] = value
     return notes
 
@@ -167,7 +167,7 @@ def convert(
         _print_results(results, json)
         return
     if len(files) != 2:
-        raise ConfigError("name a recording and what to write, or say what --to")
+        raise ConfigError("name a recording and the file to write, or give --to")
     recording, output = files
     check_new(output, force)
     with progress_bar(f"converting {recording}"):
@@ -204,9 +204,9 @@ def _write_folder(
         raise ConfigError(f"no folder {output.parent} to write {output.name} in")
     if output.exists():
         if not force:
-            raise ConfigError(f"{output} is there already: name another folder, or give --force")
+            raise ConfigError(f"{output} already exists: name another folder, or give --force")
         if not (output / MARKS[to]).is_file():
-            raise ConfigError(f"{output} is there already, and nothing that --to {to} made")
+            raise ConfigError(f"{output} already exists, and was not made by --to {to}")
     read = [Recording(path) for path in recordings]
     if to == "ros2":
         if task or video:

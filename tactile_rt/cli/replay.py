@@ -222,9 +222,7 @@ def _open_in_order(files: list[Path]) -> "list[Recording]":
     begins = []
     for recording in found:
         if differing := found[0].spec.differences(recording.spec):
-            raise ConfigError(
-                f"{recording.path} is of another array than {files[0]}: {differing[0]}"
-            )
+            raise ConfigError(f"{recording.path} has another array than {files[0]}: {differing[0]}")
         # A file may have no samples, only late decisions about those of the file before.
         first = next(recording.raw(SAMPLES, DECISIONS, EVENTS), None)
         offset = recording.description.utc_offset_ns
@@ -267,7 +265,7 @@ def _parse_speed(text: str) -> str:
     except ValueError:
         speed = -1.0
     if not (0 < speed < float("inf") or text == "max"):
-        raise ConfigError(f"--speed is max, or times the recorded pace, not {text!r}")
+        raise ConfigError(f"--speed must be max or a multiple of the recorded pace, not {text!r}")
     return repr(speed)
 
 

@@ -160,7 +160,7 @@ def check(
         raise ConfigError(f"no folder {folder}")
     check_output(plot)
     if plot and plot.suffix.lower() != ".png":
-        raise ConfigError(f"{plot}: the picture is a .png")
+        raise ConfigError(f"{plot}: the picture must be a .png")
     with needing("sim"):
         from tactile_rt.sim_backend.objects.mesh_detail import SIZE_MM
         from tactile_rt.sim_backend.objects.object_sets import open_objects

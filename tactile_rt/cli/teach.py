@@ -95,7 +95,7 @@ def teach(
             few = f"touches kept: {len(lesson.touches) if lesson else 0}, too few to learn from"
             orders.end(few)
             raise ConfigError(
-                f"{folder}: {few}: two of a class are needed; run the same command to go on"
+                f"{folder}: {few}: a class needs two touches; run the same command to go on"
             )
         began = time.process_time()
         card = lesson.learn()
@@ -315,7 +315,7 @@ def _check_labels(names: list[str]) -> None:
 def _parse_address(given: str) -> tuple[str, int]:
     host, colon, port = given.rpartition(":")
     if not colon or not host or not port.isdecimal() or int(port) > 65535:
-        raise ConfigError(f"--page is HOST:PORT, as 127.0.0.1:8791, not {given!r}")
+        raise ConfigError(f"--page must be HOST:PORT, as 127.0.0.1:8791, not {given!r}")
     return host, int(port)
 
 
@@ -331,7 +331,7 @@ def _begin(folder: Path, source: "Source") -> "Lesson":
         chunks = _record_rest(source) or chunks
         if not (moved := find_motion(chunks, source.spec)):
             break
-        typer.echo(f"that was no rest: {moved} moved")
+        typer.echo(f"not at rest: {moved} moved")
     else:
         typer.echo("going on without a rest: light touches will be missed")
     taught = FewShot(source.spec, measured_floor(chunks), measure_changes(chunks))
@@ -354,7 +354,9 @@ def _record_rest(source: "Source") -> "list[Chunk]":
             samples += len(chunk)
             sampled_at = time.monotonic()
         elif time.monotonic() - sampled_at > DEAF_S:
-            raise SourceError(f"no sample came for {DEAF_S:g} s: is the device on, and its codec?")
+            raise SourceError(
+                f"no sample came for {DEAF_S:g} s: is the device on, and the codec right?"
+            )
     return chunks
 
 

@@ -43,7 +43,7 @@ def top(
     state_s = 1: tactile-rt run robot.toml | tactile-rt top -
     """
     if json is not None and not once:
-        raise ConfigError("--json is of one look: give --once, too")
+        raise ConfigError("--json needs --once")
     console = Console()
     if once:
         found = next(_poll_snapshots(where))
@@ -89,7 +89,9 @@ def snapshot_at(url: str) -> "Snapshot":
             connection.getresponse().read(LARGEST), type=StateMessage
         ).snapshot
     except msgspec.MsgspecError as error:
-        raise ConfigError(f"http://{host}:{port}/state is not a daemon's: {error}") from None
+        raise ConfigError(
+            f"http://{host}:{port}/state is not the state of a daemon: {error}"
+        ) from None
     except (OSError, http.client.HTTPException) as error:
         why = getattr(error, "strerror", None) or str(error) or type(error).__name__
         raise SourceError(

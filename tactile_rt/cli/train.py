@@ -114,7 +114,7 @@ def _read_text(path: Path) -> str:
     try:
         return path.read_text()
     except UnicodeDecodeError:
-        raise ConfigError(f"{path} is no text file") from None
+        raise ConfigError(f"{path} is not a text file") from None
 
 
 @app.command(epilog="tactile-rt recipes")

@@ -64,7 +64,7 @@ def view(
         raise ConfigError(f"MUJOCO_GL={os.environ['MUJOCO_GL']}: {error}; unset it") from None
     suffix = film.check_suffix(out)
     if at is not None and suffix not in film.IMAGES:
-        raise ConfigError("--at is the moment of a picture: give --out a .png or .jpg")
+        raise ConfigError("--at needs a picture: an --out that ends in .png or .jpg")
     if camera not in VIEWS:
         raise ConfigError(f"no camera {camera!r}: there are {', '.join(VIEWS)}")
     if profile not in PROFILES:
@@ -121,7 +121,8 @@ def whisk(
         str | None, option("Stimuli: convex-close, ..., comma-separated. Default: all six.")
     ] = None,
     target: Annotated[
-        str | None, option("Object, not a stimulus: mug-3, or a mesh file.", "--object")
+        str | None,
+        option("Whisk against this object, not the stimuli: mug-3, or a mesh file.", "--object"),
     ] = None,
     array: Array = "mouse",
     trajectory: Annotated[
@@ -146,7 +147,7 @@ def whisk(
     for file in (out, beside):
         check_output(file)
     if json is not None and json.resolve() == beside.resolve():
-        raise ConfigError(f"{json} goes beside {out} and says what is in it: name another")
+        raise ConfigError(f"{json} is written beside {out} by this command: name another")
     with needing("sim"):
         import numpy as np
 

@@ -55,7 +55,7 @@ class BoundedQueue(Generic[T]):
     """Thread-safe queue of limited length for one reader; a full queue drops its oldest items.
 
     Args:
-        items, size: largest numbers of waiting items and bytes; a single item may be larger.
+        items, size: limits on waiting items and bytes; a single item above `size` is accepted.
         measure: returns kind, count and bytes of an item, or None to ignore it. By default an item
             has the kind ``items``, the count 1 and no bytes.
         kinds: all kinds that `measure` returns.

@@ -59,7 +59,7 @@ class RecordingError(TactileError):
 
 
 class ModelError(TactileError):
-    """A model file is damaged, incomplete or of another version; the message names the file."""
+    """A model file is damaged, unfit, or of another version or kind. The message says why."""
 
 
 def describe_error(error: BaseException, most: int | None = None) -> str:

@@ -66,7 +66,7 @@ class Admission:
             f"{t.memory_mb:.0f} MB, {1e3 * t.step_s:.1f} ms a step"
         )
         if self.classifier is not None and 1e3 * t.step_s > self.classifier.step_ms:
-            text += f", longer than the {self.classifier.step_ms:.0f} ms of it: it cannot keep up"
+            text += f", longer than a step ({self.classifier.step_ms:.0f} ms): it cannot keep up"
         return text
 
     def _run(self) -> None:

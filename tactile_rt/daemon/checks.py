@@ -231,7 +231,7 @@ def _check_folder(loaded: Loaded, folder: str) -> None:
 def _list_addresses(wanted: Wanted) -> Iterator[tuple[str, str, int]]:
     """Yield (key, host, port) of each known address at which a consumer will listen.
 
-    Ports chosen at the start are unknown, and so are the options of kinds from other packages.
+    Ports chosen at startup and options of plugin consumers are unknown here, and left out.
     """
     options = wanted.options
     if wanted.kind in ("page", "metrics", "foxglove"):

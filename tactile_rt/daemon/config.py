@@ -50,8 +50,9 @@ class ModelConfig(_Table, frozen=True, kw_only=True):
     """Table ``[[model]]``: a classifier of one source's samples.
 
     Attributes:
-        mode: ``episode`` decides from the onset on, better with every step; ``sliding`` decides as
-            long as contact lasts, each time about the newest steps, as many as an episode has.
+        mode: ``episode`` decides from the onset on, better with every step; ``sliding`` decides
+            every `every` steps while contact lasts, from a window of the newest steps as long as
+            an episode.
         every: Number of steps from one sliding decision to the next, at most those of an episode;
             0 means 4, or all steps of a shorter episode.
         sure: Probability that ends an episode early when one class reaches it in `in_a_row`
@@ -180,7 +181,7 @@ version = 1
 [[source]]
 name = "whiskers"
 url = "replay:demo?loop=true"  # six recorded objects; a device: serial:///dev/ttyACM0?codec=native
-                               # "synthetic:mouse" is made up: what is decided on it means nothing
+                               # "synthetic:mouse" is made up: decisions on it mean nothing
 # calibration = "cell-3"       # file, or id of a device: tactile-rt calibrate
 # stuck_at_s = 0                 # no change for so long: stuck-at fault; 0: if its noise is known
 # array = "array.json"         # what the device is, if its codec cannot know; or a model's .onnx

@@ -135,7 +135,7 @@ def _diagnose_source(
             why = f"when they come they are older than {most:g} s"
             found.append(Diagnostic(name, "late samples", why))
     if source.stuck_at_s or source.stuck:
-        each = f"no value of {name_some(source.stuck)} changes: it hangs, or is out of range"
+        each = f"no value of {name_some(source.stuck)} changes: stuck, or out of range"
         all_of_it = f"{'all zeros' if source.zeros else 'no value changes'}: the device hangs"
         why = all_of_it if source.stuck_at_s else each
         found.append(Diagnostic(name, "stuck-at fault", why))

@@ -113,7 +113,7 @@ class Request:
         except TimeoutError:
             raise Refused(408, "too slow") from None
         except asyncio.IncompleteReadError:
-            raise Refused(400, "the body breaks off") from None
+            raise Refused(400, "the body is cut short") from None
 
 
 @dataclass(frozen=True)
@@ -306,7 +306,7 @@ class HttpServer:
                         raise Refused(431, f"more than {most} bytes of headers")
                     more = await reader.read(most - len(data))
                     if not more:
-                        raise Refused(400, "the request breaks off")
+                        raise Refused(400, "the request is cut short")
                     data += more
         except TimeoutError:
             if not data:
@@ -397,13 +397,13 @@ def parse_head(head: bytes) -> Request:
         or not re.fullmatch(r"HTTP/1\.[0-9]", words[2])
         or CONTROL.search(first)
     ):
-        raise Refused(400, "this is no request of HTTP/1")
+        raise Refused(400, "not an HTTP/1 request")
     headers: dict[str, str] = {}
     for line in lines:
         name, colon, value = line.partition(":")
         name, value = name.lower(), value.strip(" \t")
         if not colon or not TOKEN.fullmatch(name) or CONTROL.search(value):
-            raise Refused(400, "a header is none")
+            raise Refused(400, "a header is malformed")
         if name in headers:
             if name in ONCE:
                 raise Refused(400, f"{name} is given twice")

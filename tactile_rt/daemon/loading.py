@@ -94,7 +94,7 @@ def _resolve_path(node: SettingNode, value: str) -> Path:
         try:
             path = path.expanduser()
         except RuntimeError:  # no such user
-            raise ConfigError(f"{node.where}: {value} is no folder of a user here") from None
+            raise ConfigError(f"{node.where}: {value} names no user of this computer") from None
     return path if path.is_absolute() else node.folder / path
 
 

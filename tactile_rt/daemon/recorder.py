@@ -454,8 +454,8 @@ class Recorder(Consumer):
                     track.lost = track.lost[0] + samples, track.lost[1] + packets
 
     def _leave_file(self, track: _Track, error: OSError) -> None:
-        """Stop writing a file after an error, and leave it as it is. A new file is begun later,
-        with pauses if several fail. The reason names no file, so that it stays the same.
+        """Close a file after an error; write its index unless a sync failed. A new file is begun
+        later, with pauses if several fail. The reason omits the path, so repeats look alike.
         """
         file, why = track.file, words(self._folder.path, error)
         if file is None:

@@ -76,7 +76,9 @@ class RecordingsFolder:
             self._create(parents=False)
             disk = self.path.stat().st_dev
             if self._disk not in (0, disk) and disk == os.stat("/").st_dev:
-                raise OSError("its disk is gone, and this is the system's: mount it again")
+                raise OSError(
+                    "its disk is not mounted, and this is the system disk: mount it again"
+                )
             free = shutil.disk_usage(self.path).free / MB
         except OSError as error:
             state, why = "no folder", words(self.path, error)

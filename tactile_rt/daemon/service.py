@@ -140,7 +140,7 @@ def unit_text(command: Sequence[str], config: Config, user: str) -> str:
     """
     for text in command:
         if any(ord(c) < 32 for c in text):
-            raise ConfigError(f"{text!r} cannot stand in a unit file")
+            raise ConfigError(f"{text!r} cannot be written in a unit file")
     home = any(p.startswith(("/home/", "/root/", "/run/user/")) for p in command)
     folders = [folder for _, folder in _list_outputs(config)]
     made = [
@@ -182,7 +182,9 @@ def check_folders(loaded: Loaded, user: str) -> None:
     for base in MADE.values():
         inside = next((file for file in read if file.is_relative_to(base)), None)
         if inside is not None:
-            raise ConfigError(f"the service would own {inside}, which it reads: not in {base}")
+            raise ConfigError(
+                f"the service would own {inside}, which it only reads: move it out of {base}"
+            )
         if os.path.lexists(base) and base.lstat().st_uid != _find_uid(user):
             raise ConfigError(f"folder {base}: user {user} must own it: give it to {user}")
 

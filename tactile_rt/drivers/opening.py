@@ -198,7 +198,9 @@ def open_line(url: str) -> Link[Any]:
         return SerialLink(target, serial.baud or SerialCodec.baud, serial.parity or "N", serial.dtr)
     interface, _, channel = target.partition(":")
     if scheme != "can" or not channel:
-        raise ConfigError(f"{url!r} is no line: serial:PORT?baud=... or can:INTERFACE:CHANNEL")
+        raise ConfigError(
+            f"{url!r} is not a line: use serial:PORT?baud=... or can:INTERFACE:CHANNEL"
+        )
     (can,) = take_options(f"can:{target}", fields, CanOptions)
     speeds = CanCodec.bitrate, CanCodec.data_bitrate
     return _open_bus(interface, channel, can, can.fd, speeds)

@@ -224,8 +224,8 @@ def _drop_untouched(groups: Sequence[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
     kept = [tuple(part[touch] for part in group) for group, touch in found if touch.any()]
     if not kept:
         raise RecordingError(
-            "in no validation sweep a contact was found and answered by numbers, so that nothing "
-            "can be fitted: are the loads of the sweep set in SI units? did training converge?"
+            "no validation sweep has both a contact and finite logits, so nothing can be fitted: "
+            "are the loads of the sweep set in SI units? did training converge?"
         )
     return kept
 

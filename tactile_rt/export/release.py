@@ -90,7 +90,7 @@ def release(
 
 
 def load_runner(path: Path) -> Step:
-    """Load a model file, step or window, as a function for `evaluation.measures.predict`."""
+    """Load a model file, step or window; return a function from samples to logits."""
     session, card = load_model(path, kind=None)
 
     def run(samples: Floats, offset: Floats, sigma: Floats) -> Floats:

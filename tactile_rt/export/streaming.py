@@ -344,7 +344,7 @@ class Rows:
     unseen: Tensor
 
     def write(self, cache: Tensor, values: Tensor) -> Tensor:
-        """Return a copy of a cache, (lane, head, row, number), with the tokens' values written."""
+        """Copy a cache (lane, head, row, feature), with `values` written at the tokens' rows."""
         return cache.index_put((self.lane, self.head, self.row), values)
 
 

@@ -300,7 +300,9 @@ def tactile_paper(frames: Tensor, generator: Generator, channels: int = 6) -> Te
 def augment_as_published(
     frames: Tensor, mirrored: int, turns: int, reverse: bool, channels: int = 6
 ) -> Tensor:
-    """Flip, rotate and reverse frames as `tactile_paper` does, with the given parameters.
+    """Flip, rotate and time-reverse frames as augmentation `tactile_paper` does.
+
+    The caller draws the parameters.
 
     Args:
         frames: (batch, step, sub-step * channel, row, column).

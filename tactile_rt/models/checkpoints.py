@@ -46,7 +46,7 @@ def describe_checkpoint(path: Path) -> dict[str, Any]:
         with open_regular(path) as file, zipfile.ZipFile(file) as archive:
             names = [name for name in archive.namelist() if name.endswith(PICKLE)]
             if not names:
-                raise ModelError("it is another archive")
+                raise ModelError("a zip file without a saved network")
             with archive.open(names[0]) as pickled:
                 saved = _PlainUnpickler(pickled).load()
         missing = [key for key in NEEDED if key not in saved]
@@ -89,7 +89,7 @@ class _PlainUnpickler(pickle.Unpickler):
             return OrderedDict
         if module.partition(".")[0] == "torch":
             return _skip_tensor
-        raise ModelError(f"it asks for {module}.{name}")
+        raise ModelError(f"it refers to {module}.{name}")
 
 
 def _skip_tensor(*_: Any) -> None:
@@ -105,9 +105,9 @@ def check_array(checkpoint: Path, saved: Mapping[str, Any], manifest: SweepManif
     taken, given = EADConfig(**saved["network"]).frame[0], manifest.frame[0]
     if taken != given:
         raise SpecMismatch(
-            f"{checkpoint} takes steps of {taken // channels} samples, and of the set, with one "
-            f"every {manifest.period_ns / 1e6:g} ms, a step has {given // channels}: name a set of "
-            "the sample period that it was trained at"
+            f"{checkpoint} takes steps of {taken // channels} samples, not {given // channels} as "
+            f"in the set (one every {manifest.period_ns / 1e6:g} ms): name a set with the sample "
+            "period of its training"
         )
 
 
@@ -217,7 +217,7 @@ def begin_from(
     differing = [key for key in here if key not in own_to_each and here[key] != there[key]]
     if differing or trained.inputs.element.tolist() != model.inputs.element.tolist():
         why = f"another {differing[0]}" if differing else "another array"
-        raise SpecMismatch(f"{path} cannot be begun with: it is of {why}")
+        raise SpecMismatch(f"training cannot begin with {path}: it has {why}")
     known = _name_rows((*saved["categories"], *saved["refusals"]), saved.get("kinds", {}), there)
     wanted = _name_rows(labels, kinds, here)
     both = [name for name in wanted if name in known]

@@ -103,7 +103,7 @@ class MLPAllDecoder(nn.Module):
         """
         steps = features.shape[1]
         if steps > len(self.weight):
-            raise ValueError(f"{steps} steps, but this decoder ends at {len(self.weight)}")
+            raise ValueError(f"{steps} steps; this decoder takes at most {len(self.weight)}")
         products = torch.einsum("btf,thf->bth", features, self.weight[:steps])  # (b, step, hidden)
         # At least single precision: sums of many steps would stall in autocast's types.
         exact = torch.promote_types(products.dtype, torch.float32)

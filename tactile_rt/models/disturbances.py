@@ -51,7 +51,7 @@ class Disturbance:
     def __post_init__(self) -> None:
         for name in ("noise", "gain", "dead", "rows", "offset", "drift", "rest"):
             if not getattr(self, name) >= 0:  # also if it is NaN
-                raise ConfigError(f"{name} is {getattr(self, name)}, must not be negative")
+                raise ConfigError(f"{name} must be 0 or more, not {getattr(self, name)}")
 
     def disturb_samples(self, values: Floats, data: SweepSet, rng: np.random.Generator) -> Floats:
         """Add rest, gain errors, dead whiskers, swapped channels and noise to sweeps.

@@ -175,8 +175,8 @@ def paper_units(spec: ArraySpec) -> tuple[list[float], list[float]]:
     """
     if unknown := sorted(set(spec.units) - set(PAPER_UNITS)):
         raise ConfigError(
-            f"preprocessing paper is of forces and moments: this array has {name_some(unknown)}; "
-            "take log"
+            f"preprocessing paper needs forces and moments only: this array has "
+            f"{name_some(unknown)}; take log"
         )
     units = [PAPER_UNITS[unit] for unit in spec.units]
     return [PAPER_CLIP * unit for unit in units], units

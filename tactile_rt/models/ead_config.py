@@ -86,22 +86,22 @@ class EADConfig:
             if (value := getattr(self, field)) not in known:
                 raise ConfigError(f"{field} is {value!r}, not one of {name_some(known, 8)}")
         if self.classes < 1:
-            raise ConfigError(f"classes is {self.classes}, must be at least 1")
+            raise ConfigError(f"classes must be at least 1, not {self.classes}")
         if min(self.names, self.identity) < 0:
             raise ConfigError("names and identity must be 0 or more")
         if not 0 < self.width <= WIDEST or self.width * WIDTH_UNIT % 1:
             raise ConfigError(
-                f"width is {self.width}, must be a positive multiple of 1/{WIDTH_UNIT}, "
-                f"at most {WIDEST}"
+                f"width must be a positive multiple of 1/{WIDTH_UNIT}, at most {WIDEST}, "
+                f"not {self.width}"
             )
         if not 0 <= self.norm_epsilon < math.inf:
-            raise ConfigError(f"norm_epsilon is {self.norm_epsilon}, must be 0 or more")
+            raise ConfigError(f"norm_epsilon must be 0 or more, not {self.norm_epsilon}")
         if not 0 <= self.dropout < 1:
-            raise ConfigError(f"dropout is {self.dropout}, must be in [0, 1)")
+            raise ConfigError(f"dropout must be in [0, 1), not {self.dropout}")
         if not 1 <= self.max_steps <= MAX_STEPS:
-            raise ConfigError(f"max_steps is {self.max_steps}, must be 1 to {MAX_STEPS}")
+            raise ConfigError(f"max_steps must be 1 to {MAX_STEPS}, not {self.max_steps}")
         object.__setattr__(self, "frame", tuple(self.frame))  # a list, from JSON
         if len(self.frame) != 3 or min(self.frame) < 1:
-            raise ConfigError(f"frame is {self.frame}, must be channels, rows and columns")
+            raise ConfigError(f"frame must be channels, rows and columns, not {self.frame}")
         if bool(self.graph) != (self.encoder == "graph"):
             raise ConfigError("graph must be given with encoder 'graph', and only then")

@@ -73,7 +73,7 @@ def write_budget(project: Project, budget: Budget) -> None:
 
 
 def budget_sweeps(project: Project, seconds: float) -> Budget:
-    """Time some sweeps; return the budget that fits if all stages take `seconds`."""
+    """Time some sweeps; return how many objects and draws fit if all stages share `seconds`."""
     recipe = project.recipe()
     each_s = _time_sweep(recipe)
     cores = 1 + AT_ONCE * ((os.cpu_count() or 1) - 1)

@@ -242,8 +242,8 @@ def _make_array_text(array: str, folder: Path) -> str:
         read_animals(folder / "array.toml", text)
     except ConfigError:
         raise ConfigError(
-            f"{array}: an [[animal]] is another file, which a project's copy would not find: give "
-            "its array by the whole path"
+            f"{array}: an [[animal]] names its array by a relative path, which the project's "
+            "copy would not find: give the whole path"
         ) from None
     return text
 

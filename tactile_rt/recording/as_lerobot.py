@@ -61,11 +61,11 @@ def write_dataset(
     """
     pa, pq = meta.import_pyarrow()
     if films and len(recordings) != 1:
-        raise ConfigError("films go with one recording: make a dataset of each")
+        raise ConfigError("films need a single recording: make one dataset per recording")
     spec = recordings[0].spec
     for other in recordings[1:]:
         if differing := spec.differences(other.spec):
-            raise SpecMismatch(f"{other.path} is of another array: {differing[0]}")
+            raise SpecMismatch(f"{other.path} has another array: {differing[0]}")
     ends = [_find_row_ends(recording, fps) for recording in recordings]
     width = max(int(np.diff(end, prepend=0).max()) for end in ends)
     schema = _make_schema(pa, spec, width)

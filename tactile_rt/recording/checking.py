@@ -106,8 +106,8 @@ def choose_model_file(model: Path | None, live: RecordedModel | None) -> Path:
     if live.sha256 == hash_of(shipped_model()):  # at the path of another installation
         return shipped_model()
     raise ConfigError(
-        f"the model that decided, {live.file} (sha256 {live.sha256[:16] or 'unknown'}), is not "
-        "there any more: name one by --model"
+        f"the model that decided, {live.file} (sha256 {live.sha256[:16] or 'unknown'}), no "
+        "longer exists: name one by --model"
     )
 
 

@@ -86,7 +86,7 @@ def check_shares(shares: Sequence[float]) -> None:
     whole = len(shares) == len(SPLITS) and all(s >= 0 for s in shares) and sum(shares) < inf
     if not whole or not shares[0]:
         raise ConfigError(
-            "--shares is TRAIN,VALIDATION,TEST, as 0.7,0.15,0.15: 0 or more each, and some to train"
+            "--shares must be TRAIN,VALIDATION,TEST, as 0.7,0.15,0.15: all 0 or more, TRAIN above 0"
         )
 
 

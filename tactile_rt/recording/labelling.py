@@ -154,7 +154,7 @@ def find_labelled(
         (first, sensor, period_ns), whose = like(pattern), pattern
     for one, spec in zip(recordings, specs, strict=True):
         if differing := first.differences(spec, ("name", "rate_hz")):
-            raise SpecMismatch(f"{one} is of another array than {whose}: {differing[0]}")
+            raise SpecMismatch(f"{one} has another array than {whose}: {differing[0]}")
     found = LabelledTouches(specs[0], period_ns, sensor, sums=sums)
     try:
         floor = channel_limits(first, sensor, period_ns).floor

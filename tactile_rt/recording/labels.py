@@ -85,7 +85,7 @@ def read_labels(path: Path, recordings: Sequence[Path]) -> dict[Path, list[Label
         if row.end_s <= row.start_s:
             raise refusal(node, ["end_s"], f"must be after start_s, {row.start_s:g} s")
         if not row.recording.isprintable():  # refused before it becomes a path
-            raise refusal(node, ["recording"], f"{row.recording!r} is no file's name")
+            raise refusal(node, ["recording"], f"{row.recording!r} is not a file name")
         file = path.parent / row.recording
         if not row.recording and len(recordings) > 1:
             raise refusal(node, ["recording"], "is empty; name one of several recordings")
@@ -117,7 +117,7 @@ def append_label(path: Path, recording: str, interval: LabelledInterval) -> str:
         if why := check_name(name, empty=what == "object"):
             raise ConfigError(f"{what} {name!r}: {why}")
     if not recording.isprintable() or recording.startswith("#"):  # a # begins a remark
-        raise ConfigError(f"recording {recording!r} cannot stand in {path.name}: rename it")
+        raise ConfigError(f"recording {recording!r} cannot be written in {path.name}: rename it")
     if not 0 <= interval.start_s < interval.end_s < math.inf:
         raise ConfigError(f"start_s must be 0 or more and before end_s: {interval}")
     new = not path.exists() or not path.stat().st_size

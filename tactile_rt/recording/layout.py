@@ -133,5 +133,5 @@ def decode_packet(data: bytes, wire: str) -> Packet:
         frames.append(CanFrame(identifier, data[at : at + length], extended, fd, remote))
         at += length
     if at != len(data):
-        raise ValueError("a packet of another length")
+        raise ValueError("the length of a packet is wrong")
     return frames

@@ -69,7 +69,7 @@ def film_of(text: str) -> CameraFilm:
     except ValueError:  # the @ is part of the file's name
         file, begin_s = place, 0.0
     if not (equals and name.replace("_", "").isalnum() and file and np.isfinite(begin_s)):
-        raise ConfigError(f"--video is NAME=FILE or NAME=FILE@SECONDS, not {text!r}")
+        raise ConfigError(f"--video must be NAME=FILE or NAME=FILE@SECONDS, not {text!r}")
     av = _import_av()
     try:
         with av.open(file) as film:
@@ -83,7 +83,7 @@ def film_of(text: str) -> CameraFilm:
 
 
 def write_film(film: CameraFilm, folder: Path, rows: int, fps: int) -> dict[str, NDArray[Any]]:
-    """Write a video of the newest frame at each row's time, or else the first.
+    """Write one frame per dataset row: the newest by then, or else the film's first.
 
     Returns:
         The statistics of colours, from 0 to 1, of regularly sampled frames, by LeRobot's names.

@@ -110,7 +110,7 @@ class Recording:
                         )
                     due[record.channel_id] = (expected + 1) % (1 << 32)
                     if not is_in_file_form(name, record.data, about.spec.shape):
-                        raise ValueError(f"message {expected} of {name} is none")
+                        raise ValueError(f"message {expected} of {name} cannot be decoded")
                     if name in topics:
                         t_ns = record.log_time - about.utc_offset_ns
                         yield layout.Raw(name, t_ns, plain(name, record.data))

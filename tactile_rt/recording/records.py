@@ -86,7 +86,7 @@ class _Reader:
             elif opcode == FOOTER:
                 self._read(length)
                 if self._read(len(MAGIC)) != MAGIC:
-                    raise ValueError("its end is none of an MCAP file")
+                    raise ValueError("it does not end like an MCAP file")
                 return
             else:
                 yield from self._read_single(opcode, length)
@@ -127,7 +127,7 @@ class _Reader:
         record = self._peek(begin + _FRAME.size, length)
         self._looked += length
         if self._looked > FREE + MOST_LOOKS * self._size:
-            raise _LimitExceeded("more that looks like a chunk than there is room for")
+            raise _LimitExceeded("too many places look like a chunk")
         self._at = begin + _FRAME.size + length
         try:
             if len(record) < length or not _CHUNK.unpack_from(record)[3]:  # no checksum
@@ -204,7 +204,7 @@ class _Reader:
         before = self._crc_before
         (stored,) = struct.unpack_from("<I", self._read(length))
         if stored not in (0, before):
-            raise ValueError("its checksum is another")
+            raise ValueError("its checksum is wrong")
 
     def _unpack_chunk(self, record: bytes) -> bytes:
         _, _, size, crc, name_length = _CHUNK.unpack_from(record)
@@ -226,7 +226,7 @@ class _Reader:
         if len(data) != size:
             raise ValueError(f"a chunk does not unpack to the {size} bytes that it says")
         if crc and zlib.crc32(data) != crc:
-            raise ValueError("the checksum of a chunk is another")
+            raise ValueError("the checksum of a chunk is wrong")
         return data
 
     def _split_chunk(self, data: bytes) -> "Iterator[Record]":

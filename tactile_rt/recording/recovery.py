@@ -41,7 +41,7 @@ def recover(path: str | Path, output: str | Path | None = None, force: bool = Fa
         return path
     output = path.with_name(f"{path.stem}.recovered.mcap") if output is None else Path(output)
     if output.exists() and not force:
-        raise ConfigError(f"{output} is there already: name another file, or force it")
+        raise ConfigError(f"{output} already exists: name another file, or force it")
     if output.resolve() == path.resolve():
         raise ConfigError(f"{output} is the damaged file itself: name another")
     check_not_recorded(output)
@@ -111,7 +111,9 @@ def _copy(path: Path, records: "Iterator[Record]", new: BinaryIO, about: Descrip
             else:
                 none += 1
         if none > MOST_NONE:
-            raise RecordingError(f"{path} is no recording: more than {MOST_NONE} messages are none")
+            raise RecordingError(
+                f"{path} is no recording: more than {MOST_NONE} messages cannot be decoded"
+            )
     if not whole:
         raise RecordingError(f"{path}: nothing in it is whole")
     file.finish()

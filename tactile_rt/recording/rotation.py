@@ -50,7 +50,7 @@ class Rotation:
                 return RecordingWriter(path, source, about, **further)
             except FileExistsError:  # another process has made it meanwhile
                 continue
-        raise OSError(f"{self.folder}: a thousand files of this second")
+        raise OSError(f"{self.folder}: a thousand files already begun in this second")
 
     def is_due(self, writer: RecordingWriter) -> bool:
         """Return whether the next file is due, by the present file's age and flushed size."""

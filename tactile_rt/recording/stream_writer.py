@@ -281,7 +281,7 @@ def _explain_errors(path: Path) -> Iterator[None]:
     try:
         yield
     except FileExistsError:
-        raise ConfigError(f"{path} is there already: name another file, or force it") from None
+        raise ConfigError(f"{path} already exists: name another file, or force it") from None
     except IsADirectoryError:
         raise ConfigError(f"{path} is a folder: name a file to write") from None
     except FileNotFoundError:

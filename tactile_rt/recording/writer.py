@@ -93,8 +93,7 @@ class McapFile:
         self.put(name, put_in_form(name, data, offset_ns, spec.frame), t_ns)
 
     def put(self, name: str, data: bytes, t_ns: int) -> None:
-        """Add a message that is already in its form in the file. Messages are numbered, so that
-        losses are noticed."""
+        """Add an already encoded message, with a sequence number that shows losses."""
         utc = max(0, t_ns + self.about.utc_offset_ns)
         count = self.counts[name]
         self._writer.add_message(self._channels[name], utc, data, utc, count % SEQUENCES)

@@ -131,7 +131,7 @@ class SweepManifest:
         """
         category = self.category_of.get(name) or name.rpartition("-")[0]
         if category not in self.categories and category not in self.withheld:
-            raise RecordingError(f"{MANIFEST} is damaged: {name} is of no category it names")
+            raise RecordingError(f"{MANIFEST} is damaged: {name} has a category that is not listed")
         return category
 
     def label(self, name: str) -> int:

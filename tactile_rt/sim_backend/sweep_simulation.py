@@ -71,7 +71,7 @@ def check_sweep(sweep: Sweep, profile: Profile) -> None:
     """Raise a `ConfigError` if the profile's engine cannot step such a sweep."""
     for name in ("head_moves", "shake_g", "gravity_x_g", "gravity_y_g", "gravity_z_g", "tilt_deg"):
         if getattr(sweep, name) and engine_of(profile) == "mujoco":
-            raise ConfigError(f"{name}: MuJoCo's world has no weight and a head that stands still")
+            raise ConfigError(f"{name}: MuJoCo simulates neither gravity nor a moving head")
 
 
 class World(Protocol):

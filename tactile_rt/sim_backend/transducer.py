@@ -57,7 +57,7 @@ def sensor_of(animals: Sequence[WhiskerArray]) -> SensorSpec | None:
             if stiff := [w.name for w in animal.whiskers if not w.mount_stiffness]:
                 raise ConfigError(
                     f"sensor: reads how far bases turn, but the mount of whisker {stiff[0]} of "
-                    f"{animal.name} does not give; give it mount_stiffness_nm_rad"
+                    f"{animal.name} is rigid; give it mount_stiffness_nm_rad"
                 )
     return whole
 

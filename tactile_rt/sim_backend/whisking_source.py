@@ -62,7 +62,7 @@ def parse_point(text: str, key: str) -> tuple[float, float, float]:
             raise ValueError
     except ValueError:
         raise ConfigError(
-            f"{key} is three numbers x,y,z of at most {LARGEST_MM:g}, not {text!r}"
+            f"{key} must be three numbers x,y,z of at most {LARGEST_MM:g}, not {text!r}"
         ) from None
     return x, y, z
 

@@ -131,7 +131,7 @@ def array_spec(whiskers: tuple[Whisker, ...], name: str) -> ArraySpec:
 def world_spec(animals: Sequence[WhiskerArray]) -> ArraySpec:
     """Describe the base loads of all arrays in one world, as `array_spec` does for one.
 
-    With several arrays, the mount frame is the world; element frames are as in `array_spec`.
+    With several arrays, positions and orientations are in world axes.
     """
     if len(animals) == 1:
         return array_spec(animals[0].whiskers, animals[0].name)

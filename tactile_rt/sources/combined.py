@@ -120,14 +120,14 @@ def combine_specs(
     """Combine array specs into one, with each array's grid rows below the previous array's.
 
     Raises:
-        ConfigError: the arrays do not measure the same channels, or two have one name.
+        ConfigError: the arrays do not measure the same channels, or two have the same name.
     """
     for spec, part in zip(specs, parts, strict=True):
         if (spec.channels, spec.units) != (specs[0].channels, specs[0].units):
             raise ConfigError(
                 f"{part.name} measures {', '.join(spec.channels)} ({', '.join(spec.units)}), "
                 f"{parts[0].name} {', '.join(specs[0].channels)} ({', '.join(specs[0].units)}): "
-                "arrays that are combined measure the same"
+                "combined arrays must measure the same"
             )
     grid, rows = [], 0
     positions, orientations = [], []

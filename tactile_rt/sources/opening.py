@@ -85,7 +85,7 @@ def check_model(model: Path, url: str) -> None:
 def _prepare_source(url: str, calibration: str, array: str, check: bool) -> Prepared:
     scheme, target, fields = split_url(url)
     if array and "array" in fields:
-        raise ConfigError(f"{url}: the array is given twice: in the URL, and beside it")
+        raise ConfigError(f"{url}: the array is given twice: in the URL and separately")
     file = fields.pop("array", array)
     spec = read_array(Path(file)) if file else None
     prepared = _prepare_scheme(url, scheme, target, fields, spec, check)

@@ -345,7 +345,7 @@ def check_label(name: str) -> str:
     if why := labels.check_name(name):
         raise ConfigError(f"label {name!r}: {why}")
     if name in ORDERS or name.partition(" ")[0] in NAMING:
-        raise ConfigError(f"label {name!r}: is an order to who teaches; name it otherwise")
+        raise ConfigError(f"label {name!r} is a command of `teach`; choose another label")
     return name
 
 

@@ -64,7 +64,7 @@ class TeachingPage:
             only(request, "POST")
             order = (await json_body(request, _Order)).order
             if not order or len(order) > MAX_ORDER:
-                raise Refused(400, f"an order has 1 to {MAX_ORDER} characters")
+                raise Refused(400, f"a command must have 1 to {MAX_ORDER} characters")
             self._obey(order)
             return Response(202)
         raise Refused(404, "there is no such page")

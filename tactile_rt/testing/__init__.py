@@ -133,7 +133,7 @@ def _make_source(
         return signal
     values = np.asarray(signal, np.float32)
     if values.ndim != 3:
-        raise ConfigError(f"a signal is (n, element, channel), not {values.shape}")
+        raise ConfigError(f"a signal must be (n, element, channel), not {values.shape}")
     elements, channels = values.shape[1:]
     spec = spec or make_codec(wire, codec, dict(further.get("options") or {})).spec
     spec = spec or synthetic_spec(elements, channels, 1000.0)

@@ -41,7 +41,7 @@ def test_a_published_file_builds_a_paper_code_benchmark(rates, tmp_path):
 def test_its_stimuli_have_no_names_so_strict_refuses_it(rates, tmp_path):
     np.savez_compressed(tmp_path / "rates.npz", **rates)
     assert "its stimuli have no names" in refusal(build, [tmp_path / "rates.npz"])
-    with pytest.raises(ConfigError, match="name nothing beside it"):
+    with pytest.raises(ConfigError, match="give no other file"):
         build([tmp_path / "rates.npz", tmp_path], "paper-code")
 
 
@@ -117,7 +117,7 @@ def test_requests_that_cannot_be_met(tmp_path):
     with pytest.raises(ConfigError, match="no protocol 'loose': there are strict, paper-code"):
         build([tmp_path], "loose")
     assert "name NWB files" in refusal(build, [])
-    assert "0 bootstraps" in refusal(build, [tmp_path], bootstraps=0)
+    assert "bootstraps must be 1 or more" in refusal(build, [tmp_path], bootstraps=0)
 
 
 def test_without_h5py_it_says_what_to_install(tmp_path, monkeypatch):

@@ -204,7 +204,7 @@ def test_what_cannot_be_averaged_is_left_out_and_named(session, tmp_path, name):
         (units_of(reset, *range(UNITS)), "no unit can be used; .*4 of 4 .* go back"),
         (units_of(lambda t: 1e3 * t, *range(UNITS)), "no unit can be used; .* ms"),
         (units_of(lambda t: t[:0], *range(UNITS)), "no unit can be used; .* no spikes"),
-        (units_of(lambda t: t[(t - 5.91) % 6.5 > 4], *range(UNITS)), "none of 4 units has a spike"),
+        (units_of(lambda t: t[(t - 5.91) % 6.5 > 4], *range(UNITS)), "no spike of 4 units falls"),
         (trials(start_time=lambda t: 0 * t), "no trial is left .* start_time goes back|choice"),
         (trials(choice_time=lambda t: t * np.nan), "no trial is left .* choice_time is not"),
     ],

@@ -106,7 +106,7 @@ def test_a_brain_that_cannot_be(tmp_path):
     for wrong in ({"mice": 0}, {"trials": 0}, {"private": 1.5}):
         with pytest.raises(ConfigError, match=next(iter(wrong))):
             Brain(**wrong)
-    with pytest.raises(ConfigError, match="is there already"):
+    with pytest.raises(ConfigError, match="already exists"):
         write_example(tmp_path, SMALL)
-    with pytest.raises(ConfigError, match="at least 0"):
+    with pytest.raises(ConfigError, match="seed must be 0 or more"):
         write_example(tmp_path / "x", SMALL, seed=-1)

@@ -163,7 +163,7 @@ def test_the_command(archive, tmp_path, monkeypatch, call):
     for arguments, said in (
         (("000231", tmp_path / "other"), "the server says 404"),
         (("000231",), "name a folder"),
-        (("000231", small, "--session", "none"), "no session of 2 is of none"),
+        (("000231", small, "--session", "none"), "none of 2 sessions matches none"),
         (("example", small), "example cannot be fetched"),
         (("00231", small), "did you mean 000231"),
     ):

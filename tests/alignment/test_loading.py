@@ -97,7 +97,7 @@ def test_a_layer_is_of_the_encoder_unless_its_name_says_so(tmp_path):
 @pytest.mark.parametrize("names", [("stem", "encoder.stem"), ("encoder.stem", "stem")])
 def test_no_layer_takes_the_place_of_another(tmp_path, names):
     np.savez(tmp_path / "a.npz", **{name: RNG.normal(size=(6, 4)) for name in names})
-    with pytest.raises(ConfigError, match=r"arrays stem and encoder\.stem are one layer"):
+    with pytest.raises(ConfigError, match=r"arrays stem and encoder\.stem are the same layer"):
         read_responses(tmp_path / "a.npz")
 
 

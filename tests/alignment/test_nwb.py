@@ -265,7 +265,7 @@ PITFALLS = {
         ),
         "has 1099511627776 values, more than a session can have",
     ),
-    "no contacts": (no_contacts, "without them only protocol paper-code"),
+    "no contacts": (no_contacts, "without them, use protocol paper-code"),
     "contacts without times": (
         drop("processing/behavior/contacts_by_whisker_C0/start_time"),
         "contacts_by_whisker_C0 lacks the column start_time",

@@ -97,7 +97,7 @@ def test_what_cannot_be_selected(asked, said):
 
 
 def test_what_nothing_is_left_of(folder, tmp_path):
-    with pytest.raises(ConfigError, match="no session of 4 is of nosuch"):
+    with pytest.raises(ConfigError, match="none of 4 sessions has units that match: nosuch"):
         read_nwb(files(folder), selection=Selection.of(sessions=["nosuch"]))
     path = changed_copy(files(folder)[0], tmp_path / "a.nwb", remove("units/depth"))
     with pytest.raises(ConfigError, match=r"a\.nwb: has no column units/depth to select by"):
@@ -174,9 +174,9 @@ def test_sessions_of_few_spikes_are_no_copies():
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"stimulus": np.full(48, -1)}, "a stimulus is a number from 0 to 5"),
+        ({"stimulus": np.full(48, -1)}, "stimuli must be numbers from 0 to 5"),
         ({"rates": np.full((48, 9), np.nan)}, "a rate is not finite"),
-        ({"rates": np.zeros((47, 9))}, "rates .* do not fit"),
+        ({"rates": np.zeros((47, 9))}, ".* rates need a stimulus"),
         ({"depth": np.zeros(3)}, r"depth is \(3,\), not \(9,\)"),
         ({"course": np.zeros((48, 22, 3))}, "course is .* not .trial, bin, unit"),
         ({"begin": np.zeros(3)}, r"begin is \(3,\), not \(48,\)"),

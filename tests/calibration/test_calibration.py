@@ -456,7 +456,7 @@ A1 = [[1.0, 0.0], [0.1, 1.0]]
         ('device = "d"', "device = 7", "device: expected text, got 7"),
         ("[1, 2.5]", "[1, 2.5, 3]", "tare.A0 has 3 values for 2 raw channels"),
         ("[1, 2.5]", '[1, "2,5"]', "tare.A0[1]: expected a number, got '2,5'"),
-        ("[tare]", '[mirror]\naxis = "w"\n[tare]', "mirror.axis is x, y or z, not 'w'"),
+        ("[tare]", '[mirror]\naxis = "w"\n[tare]', "mirror.axis must be x, y or z, not 'w'"),
     ],
 )
 def test_a_bad_file_is_one_line_that_names_it(tmp_path, old: str, new: str, what: str) -> None:

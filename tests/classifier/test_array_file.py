@@ -36,7 +36,7 @@ def test_of_a_model_it_is_the_array_that_it_was_made_for() -> None:
         ("a.json", small_spec().to_json().replace("1000.0", '"fast"'), "rate_hz: expected a num"),
         ("a.json", small_spec().to_json().replace('"A1"', '"A0"'), "elements repeat"),
         ("a.onnx", "no model", "is not a readable ONNX model: it is text"),
-        ("robot.toml", 'name = "robot"\n', "--out robot.json` writes the array"),
+        ("robot.toml", 'name = "robot"\n', "--out robot.json`"),
     ],
 )
 def test_what_describes_none_is_refused_in_one_line(

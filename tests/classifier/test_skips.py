@@ -128,7 +128,7 @@ def test_age_makes_a_step_late_as_work_does() -> None:
 
 
 def test_an_unknown_way_to_catch_up_is_refused(model: Path) -> None:
-    with pytest.raises(ConfigError, match="catch_up: 'oldest'; it can be newest, all"):
+    with pytest.raises(ConfigError, match="catch_up must be one of newest, all, not 'oldest'"):
         Classifier(model, SAME_RATE, catch_up="oldest")  # type: ignore[arg-type]
 
 

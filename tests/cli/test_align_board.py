@@ -78,8 +78,8 @@ def test_mistakes_are_one_line(refused, brain, tmp_path):
     data = ("--data", f"example={brain / 'recordings'}")
     np.savez(tmp_path / "odd.npz", a=np.zeros((5, 3)))
     for arguments, said in (
-        ((), "name recordings: --data NAME=PATH"),
-        (("--data", "example"), "--data is NAME=PATH"),
+        ((), "name recordings: --data DATASET=PATH"),
+        (("--data", "example"), "--data must be DATASET=PATH"),
         (("--data", "exmple=x"), "did you mean example"),
         ((*data, "--metric", "rsaa"), "did you mean rsa"),
         ((*data, "--part", "L7"), "no part of cortex"),

@@ -56,13 +56,15 @@ def test_the_page_s_commands_measure_and_then_write(project: Project, call) -> N
     before = project.array.read_text()
     code, out, err = call(*look)
     assert (code, err) == (0, "")
-    assert out.endswith("not written: --out FILE takes what was measured, also the array's own\n")
+    assert out.endswith(
+        "not written: give --out FILE to save them; the array's own file is allowed\n"
+    )
     assert project.array.read_text() == before
     shown = {" ".join(line.split()[:4]) for line in out.splitlines()}
     assert {"rate Hz 500 500", "resolution of my N", "resonance of A0 Hz"} <= shown
     code, out, err = call(*change)
     assert (code, err) == (0, "")
-    assert re.search(r"whiskers/array.toml: \d values brought to what was measured\n$", out)
+    assert re.search(r"whiskers/array.toml: \d values set to the measured ones\n$", out)
     array = load_array(str(project.array))
     assert [c.noise_density for c in array.sensor.channels] == pytest.approx([3e-9] * 2, rel=0.1)
     assert array.whiskers[0].young_modulus == pytest.approx(4.1e9, rel=0.05)

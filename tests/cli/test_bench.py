@@ -62,7 +62,7 @@ def test_inference_loses_no_sample_uncounted(call, tmp_path, monkeypatch):
     code, out, _ = call("bench", "inference", "--quick", "--json", tmp_path / "figures.json")
     figures = {r["name"]: r for r in json.loads((tmp_path / "figures.json").read_text())}
     assert code == 0
-    assert "of 7 bars met" in out
+    assert "of 7 requirements met" in out
     assert figures["inference.slow_dropped"]["value"] > 0  # the consumer was too slow
     assert figures["inference.slow_uncounted"]["value"] == 0
     assert figures["inference.size"]["met"]

@@ -243,7 +243,7 @@ def test_mistakes_in_a_table_are_one_line(refused, device, tmp_path, loads):
     table = write_table(tmp_path / "loads.csv", loads[:2])
     assert "loads.csv: 2 loads for 2 channels and an offset" in refused("calibrate", table)
     said = refused("calibrate", table, "--source", "gauges:")
-    assert "has readings of its own: leave out --source" in said
+    assert "has readings: leave out --source" in said
     table.write_text("start_s,end_s,fy\n0,1,1\n5,6,2\n")
     assert "name the recording they are in with --source" in refused("calibrate", table)
     command = ("calibrate", table, "--source", "gauges:")

@@ -42,7 +42,7 @@ NO_FIGURES = {
 # Options that are text in some commands and a file in others.
 OF_TWO_KINDS = {
     "--array": "a name or a file; of `array fit` a file alone",
-    "--data": "a sweep set; of `align board` NAME=PATH",
+    "--data": "a sweep set; of `align board` DATASET=PATH",
     "--model": "a file; of `teach` also `shipped`",
 }
 MOST_NAMES = 105  # of options, over all commands: fewer are easier to remember

@@ -106,10 +106,10 @@ def torch():
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (("--set", "width=0.1"), "width is 0.1, must be a positive multiple of 1/32"),
+        (("--set", "width=0.1"), "width must be a positive multiple of 1/32"),
         (("--set", "attender=lstm"), "attender is 'lstm', not one of gpt, mamba, none"),
         (("--seed", -1), "seed must be 0 to 4294967295"),
-        (("--set", "learning_rate=nan"), "--set learning_rate=nan: nan is no quantity"),
+        (("--set", "learning_rate=nan"), "--set learning_rate=nan: nan is not a finite number"),
         (("--accelerator", "glove"), "accelerator is 'glove': "),
         (("--threads", 10**30), "'--threads'"),
         (
@@ -224,7 +224,7 @@ def test_a_model_is_evaluated_only_on_what_it_was_made_for(
 
     spec = describe_set(tiny_recipe()).spec.to_json()
     changed = tiny_model(spec=spec.replace('"fx"', '"gx"'))
-    other_array = f"was made for another array than {sweep_set} is of: channels[0]"
+    other_array = f"was made for another array than that of {sweep_set}: channels[0]"
     assert other_array in refused("eval", changed, sweep_set)
     changed = tiny_model(period_ns=1_000_000)
     assert "a sample every 1000000 ns" in refused("eval", changed, sweep_set)

@@ -51,7 +51,7 @@ def test_unless_told_otherwise_objects_pass_that_the_model_has_never_met(call, m
     [
         (["--wire", "usb"], "wire must be one of serial, slcan, virtual"),
         (["--set", "form=int16"], "no option 'form'; did you mean format?"),
-        (["--source", "synthetic:", "--sweeps", 3], "--sweeps is of a sim: source"),
+        (["--source", "synthetic:", "--sweeps", 3], "--sweeps needs a sim: source"),
         (["--source", "synthetic:3x6?seconds=1"], "was made for another array"),
     ],
 )

@@ -29,7 +29,7 @@ def test_bytes_become_a_recording_of_their_name(call, done, raw):
 
 def test_what_is_there_is_replaced_only_if_forced(call, refused, raw):
     call("import", "raw.bin", "--as", "codec=bota")
-    assert "is there already" in refused("import", "raw.bin", "--as", "codec=bota")
+    assert "already exists" in refused("import", "raw.bin", "--as", "codec=bota")
     assert call("import", "raw.bin", "--as", "codec=bota", "--force")[0] == 0
 
 
@@ -42,8 +42,11 @@ def test_what_is_there_is_replaced_only_if_forced(call, refused, raw):
         (("raw.bin", "--as", "codec=ft300"), "no whole ft300 sample .*`tactile-rt sniff raw.bin`"),
         (("raw.bin", "--columns", "S.fx"), "is no table of numbers"),
         (("raw.bin", "--as", "codec=bota", "--form", "pcap"), "no form 'pcap'"),
-        (("raw.bin", "--columns", "S.fx", "--decimal", ";"), "--decimal is , or ."),
-        (("raw.bin", "--columns", "S.fx", "--delimiter", ",,"), "--delimiter is one character"),
+        (("raw.bin", "--columns", "S.fx", "--decimal", ";"), "--decimal must be , or ."),
+        (
+            ("raw.bin", "--columns", "S.fx", "--delimiter", ",,"),
+            "--delimiter must be one character",
+        ),
     ],
 )
 def test_what_cannot_be_is_one_line(refused, raw, options, why):

@@ -196,17 +196,17 @@ def test_a_set_is_replaced_on_demand_and_nothing_else_is(here, night, tmp_path, 
     out = tmp_path / "set"
     shutil.copytree(night, out)
     err = refused("label", recording, out)
-    assert f"{out} is there already: name another folder, or give --force" in err
+    assert f"{out} already exists: name another folder, or give --force" in err
     _, err = lines_of(call, "label", recording, out, "--force", "--shares", "0.5,0.25,0.25")
     assert "24 of 24 touches" in err
     assert "is made of recordings, by `tactile-rt label`" in refused("sweep", out)
     assert [p.name for p in tmp_path.iterdir()] == ["set"]
     lines_of(call, "sweep", out, "--verify")
     err = refused("label", recording, here / "data" / "robot", "--force")
-    assert "is no set of recordings, and stays" in err
+    assert "is not a set of recordings, and is not replaced" in err
     (out / "notes.txt").touch()
     err = refused("label", recording, out, "--force")
-    assert f"{out} holds 'notes.txt', too, and stays" in err
+    assert f"{out} holds 'notes.txt', too, and is not replaced" in err
     err = refused("label", recording, tmp_path / "no" / "set")
     assert "no folder" in err
 
@@ -222,9 +222,9 @@ def test_what_is_wrong_is_one_line(here, tmp_path, refused):
         ((recording, out, "--labels", said), "said.csv:3: end_s: expected a number, got 'x'"),
         ((recording, out, "--by-name", "--unlabelled"), "exclude one another: give one"),
         ((recording, recording, out), "is named twice: name it once"),
-        ((recording, out, "--shares", "much"), "--shares is TRAIN,VALIDATION,TEST"),
+        ((recording, out, "--shares", "much"), "--shares must be TRAIN,VALIDATION,TEST"),
         ((recording, out, "--like", tmp_path), "is not a sweep set"),
-        ((recording, tmp_path / "o\udcff"), "o\\udcff' is no UTF-8: rename it"),
+        ((recording, tmp_path / "o\udcff"), "o\\udcff' is not UTF-8: rename it"),
         ((recording, out, "--json", recording), "is another file of this command"),
         ((recording, out, "--json", here / "labels.csv"), "holds the labels that are read"),
         ((recording, out, "--json", out), "is another file of this command"),

@@ -73,7 +73,7 @@ def test_verify_finds_a_graph_that_remembers_bad_samples(call, tmp_path):
     path = write_model(tmp_path / "m.onnx", REMEMBERS)
     code, _, err = call("model", "verify", path)
     assert (code, err.count("\n")) == (2, 1)
-    assert f"{path}: a sample that is no number is not taken for no load" in err
+    assert f"{path}: an invalid (NaN) sample must count as no load" in err
 
 
 def test_a_stranger_s_text_cannot_command_the_terminal(done, tmp_path):
@@ -104,7 +104,7 @@ def test_verify_finds_another_graph(call, sealed):
     path = sealed(hashes={"graph": "0" * 64})
     code, _, err = call("model", "verify", path)
     assert (code, err.count("\n")) == (2, 1)
-    assert f"{path}: the graph is another than was exported: sha256 " in err
+    assert f"{path}: the graph is not the exported one: sha256 " in err
 
 
 @pytest.mark.parametrize(
@@ -142,4 +142,4 @@ def test_bench_times_steps(done, sealed):
 
 def test_bench_refuses_a_window(refused, tmp_path):
     path = write_model(tmp_path / "m.onnx", WINDOW, kind="window", state=())
-    assert "only steps are timed" in refused("model", "bench", path)
+    assert "only step models are timed" in refused("model", "bench", path)

@@ -102,13 +102,13 @@ def test_a_lerobot_dataset_is_made(call, refused, path):
     precious = path.with_name("precious")
     precious.mkdir()
     said = refused("convert", path, precious, "--to", "lerobot", "--force")
-    assert "nothing that --to lerobot made" in said
+    assert "was not made by --to lerobot" in said
 
 
 def test_a_file_that_is_there_is_not_written_over(call, refused, path):
     path.write_bytes(b"precious")
     said = refused("record", SOURCE, path)
-    assert said == f"tactile-rt: {path} is there already: name another file, or give --force\n"
+    assert said == f"tactile-rt: {path} already exists: name another file, or give --force\n"
     assert path.read_bytes() == b"precious"
     assert call("record", SOURCE, path, "--force")[0] == 0
     assert samples(path) == 300
@@ -146,12 +146,15 @@ def test_what_another_process_is_recording_is_not_replaced(again, call, refused,
     ("arguments", "said"),
     [
         (("record", SOURCE, "none/x.mcap"), "no folder none to write x.mcap in"),
-        (("record", SOURCE, "run.csv"), "run.csv: a recording is a .mcap; `tactile-rt convert`"),
-        (("record", SOURCE, "x.mcap", "--note", "who"), "--note is NAME=VALUE, not 'who'"),
+        (
+            ("record", SOURCE, "run.csv"),
+            "run.csv: a recording must end in .mcap; `tactile-rt convert`",
+        ),
+        (("record", SOURCE, "x.mcap", "--note", "who"), "--note must be NAME=VALUE, not 'who'"),
         (("recover", "none.mcap"), "no recording none.mcap"),
         (("convert", "none.mcap", "x.txt"), "none of .npz, .csv, .h5"),
         (("convert", "text.mcap", "x.csv"), "text.mcap is not an MCAP file"),
-        (("convert", "text.mcap"), "name a recording and what to write, or say what --to"),
+        (("convert", "text.mcap"), "name a recording and the file to write, or give --to"),
         (("convert", "text.mcap", "--to", "ros"), "did you mean ros2?"),
     ],
 )

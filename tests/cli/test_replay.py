@@ -148,10 +148,10 @@ def test_a_check_needs_the_model_that_decided(call, refused, live, tmp_path):
         said = refused("replay", known, "--check", "--name", "left", *arguments)
         assert "needs the model that decided, sha256 0000000000000000" in said
     said = refused("replay", known, "--name", "left")
-    assert "is not there any more: name one by --model" in said
+    assert "no longer exists: name one by --model" in said
     moved = again(path, tmp_path / "moved.mcap", **{key: "/gone/tiny.onnx sha256:"})
     said = refused("replay", moved, "--name", "left")
-    assert "/gone/tiny.onnx (sha256 unknown), is not there any more" in said
+    assert "/gone/tiny.onnx (sha256 unknown), no longer exists" in said
     # another model is what a replay is for, as long as it is not to be the same
     mine = call("replay", path, "--name", "left")
     others = call("replay", path, "--name", "left", "--model", other)
@@ -237,7 +237,10 @@ def test_what_another_codec_makes_of_the_packets_is_told(call, tmp_path):
     [
         (("{path}",), "several models decided live: choose by --name left, last"),
         (("{path}", "--name", "best"), "no model 'best' decided live; there are left, last"),
-        (("{path}", "--speed", "fast"), "--speed is max, or times the recorded pace, not 'fast'"),
+        (
+            ("{path}", "--speed", "fast"),
+            "--speed must be max or a multiple of the recorded pace, not 'fast'",
+        ),
         (("{path}", "--name", "left", "--model", "x.onnx"), "model x.onnx cannot be read"),
         (("{path}", "--name", "left", "--codec", "natve"), "did you mean native?"),
         (("{path}", "--codec", "native?speed=3"), "are not options of a codec"),

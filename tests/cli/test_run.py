@@ -94,7 +94,7 @@ def test_an_element_of_a_device_that_hangs_is_named(tmp_path):
         with start_program("run", *options) as process:
             said = process.stderr.readline()
             process.terminate()
-    assert said == "no value of A3 changes: it hangs, or is out of range\n"
+    assert said == "no value of A3 changes: stuck, or out of range\n"
 
 
 @pytest.fixture

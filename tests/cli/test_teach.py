@@ -132,9 +132,9 @@ def test_mistakes_are_one_line(call, lesson, tmp_path):
     for arguments, said in (
         (("synthetic:3x2", tmp_path / "a", "--classes", "a/b"), "cannot be part of a file's name"),
         (("synthetic:3x2", tmp_path / "a", "--classes", "unknown"), "has a meaning of its own"),
-        (("synthetic:3x2", tmp_path / "a", "--classes", "b,undo"), "is an order to who teaches"),
-        (("synthetic:3x2", tmp_path / "a", "--page", "here"), "--page is HOST:PORT"),
-        (("synthetic:3x2", tmp_path / "a\udcff", "--classes", "a"), "is no UTF-8: rename it"),
+        (("synthetic:3x2", tmp_path / "a", "--classes", "b,undo"), "is a command of `teach`"),
+        (("synthetic:3x2", tmp_path / "a", "--page", "here"), "--page must be HOST:PORT"),
+        (("synthetic:3x2", tmp_path / "a\udcff", "--classes", "a"), "is not UTF-8: rename it"),
         (("synthetic:3x2", folder, "--json", folder / LABELS), "is a file of the lesson, or its"),
         (("synthetic:3x2", folder, "--classes", "a"), "or teach in another folder"),
         (("serial:/dev/none?codec=bota", tmp_path / "a", "--classes", "a"), "no such port"),
@@ -275,7 +275,7 @@ def test_letters_and_numbers_are_orders(tmp_path):
         words = ("teach", url(line), tmp_path / "a", "--classes", "press,slide", "--touches", "9")
         done = run_program(*words, input="n\nrub\n7\nu\n1\nq\n")
     assert done.returncode == 2
-    assert "too few to learn from: two of a class are needed" in done.stderr
+    assert "too few to learn from: a class needs two touches" in done.stderr
     for said in ("touch it: slide (1 of 9)", "touch it: rub (1 of 9)",
                  "there is no class 7: there are 3", "there is no touch to take back"):  # fmt: skip
         assert said in done.stdout

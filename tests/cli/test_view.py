@@ -66,7 +66,7 @@ def test_a_video_lasts_as_much_longer_as_it_is_slower(view):
         (("--out", "a.png", "--camera", "above"), "no camera 'above': there are front, side, top"),
         (("--out", "a.png", "--profile", "fast"), "no profile 'fast'"),
         (("--out", "a.png", "--at", 1e6), "the sweep lasts"),
-        (("--out", "a.mp4", "--at", 5), "--at is the moment of a picture"),
+        (("--out", "a.mp4", "--at", 5), "--at needs a picture"),
     ],
 )
 def test_mistakes_are_one_line_and_leave_nothing(refused, cwd, options, said):

@@ -86,8 +86,8 @@ def test_without_a_sensor_only_forces_and_moments_are_believed() -> None:
     "spec, what, why",
     [
         (MZ, {"range": 0.0}, "range must be more than 0"),
-        (MZ, {"noise_density": 0.0}, "noise_density, its resolution, or both"),
-        (MZ, {"of": {"fq": 1.0}}, f"of has no 'fq': it knows {', '.join(LOADS)}"),
+        (MZ, {"noise_density": 0.0}, "needs noise_density, resolution, or both"),
+        (MZ, {"of": {"fq": 1.0}}, f"of has no 'fq': there are {', '.join(LOADS)}"),
         (MZ, {"field": "w"}, "field must be x, y or z"),
         (MZ, {"field": "x", "of": {"fx": 1.0}}, "not both"),
         (MZ, {"name": "volts"}, "volts is no load; say what it reads with of"),
@@ -100,7 +100,7 @@ def test_without_a_sensor_only_forces_and_moments_are_believed() -> None:
         (
             SENSOR,
             {"channels": (FIELD,), "magnet": MAGNET, "matrix": {"A0": ((0.0,) * 6,)}},
-            "which a matrix cannot say",
+            "which a matrix cannot describe",
         ),
         (MAGNET, {"moment_a_m2": 0.0}, "must not be 0"),
         (MAGNET, {"sensor_mm": (0, 0, 0)}, "must be apart"),

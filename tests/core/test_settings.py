@@ -60,7 +60,7 @@ def test_a_mistake_is_named(fields, said):
 
 @pytest.mark.parametrize("text", ["nan", "-inf", "1e999"])
 def test_what_is_no_quantity_is_refused_in_text_and_in_toml(text):
-    said = f"{float(text)} is no quantity"
+    said = f"{float(text)} is not a finite number"
     assert refusal(take_options, "sensor", {"scale": text}, Device) == f"sensor: scale: {said}"
     if text != "1e999":
         assert refusal(parse_toml, f"a = [1.0, {text}]", "x.toml") == f"x.toml:1: a[1]: {said}"
@@ -137,7 +137,7 @@ def test_a_document_becomes_a_struct():
          "x.toml:3: limit[1] has no key 'stop_ms'; did you mean stop_s, in seconds?"),
         ("[[limit]]\nstop_s = -1", "x.toml:1: limit[0]: stop_s must be 0 or more"),
         ("[limit]", "x.toml:1: there may be several of limit: write [[limit]]"),
-        ("[[table]]", "x.toml:1: there is but one: write [table]"),
+        ("[[table]]", "x.toml:1: only one is allowed: write [table]"),
         ("[table]\nlimit = 1", "x.toml:2: table has no key 'limit'; it is a table of the file: "
          "write [[limit]]"),
         ("reads = [1]", "x.toml:1: reads[0]: expected text or a table, got 1"),
@@ -183,7 +183,7 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path):
     assert refusal(read_toml, path) == f"{path}:2: not UTF-8 text"
     path.write_text("\ufeffa = 1\n")
     assert read_toml(path).plain() == {"a": 1}
-    assert refusal(read_toml, path, 3) == f"{path}: larger than 0 MB: not such a file"
+    assert refusal(read_toml, path, 3) == f"{path}: larger than 0 MB: too large for such a file"
 
 
 def test_rows_of_a_table(tmp_path):
@@ -206,10 +206,10 @@ def test_rows_of_a_table(tmp_path):
     [
         ("", ": is empty; its first line names the columns"),
         ("x;y\n", ":1: columns are separated by semicolons; use commas"),
-        ("x,x\n", ":1: column 'x' is there twice; remove one"),
+        ("x,x\n", ":1: column 'x' appears twice; remove one"),
         ("x,y\n1\n", ":2: 1 values for 2 columns"),
         ("x,y\n1,2\n1,a\n", ":3: y: expected a number, got 'a'"),
-        ("x,y\n1,nan\n", ":2: y: nan is no quantity"),
+        ("x,y\n1,nan\n", ":2: y: nan is not a finite number"),
         ("x,y\n1,\n", ":2: y: expected a number, got ''"),
     ],
 )

@@ -113,8 +113,8 @@ def test_a_pipe_is_no_configuration(tmp_path):
 @pytest.mark.parametrize(
     ("setting", "message"),
     [
-        ("page.port", "--set page.port: a setting is KEY=VALUE"),
-        ("page..port=1", "--set page..port=1: a setting is KEY=VALUE"),
+        ("page.port", "--set page.port: a setting must be KEY=VALUE"),
+        ("page..port=1", "--set page..port=1: a setting must be KEY=VALUE"),
         (
             "source.wiskers.url=x",
             "--set source.wiskers.url=x: no source 'wiskers'; did you mean whiskers?",
@@ -122,7 +122,10 @@ def test_a_pipe_is_no_configuration(tmp_path):
         ("page.prot=1", "--set page.prot=1: page has no key 'prot'; did you mean port?"),
         ("page.port=x", "--set page.port=x: page.port: expected a whole number, got 'x'"),
         ("version.a=1", "--set version.a=1: version has a value, not keys"),
-        ("source.whiskers=1", "--set source.whiskers=1: source[0] is a table: say which key of it"),
+        (
+            "source.whiskers=1",
+            "--set source.whiskers=1: source[0] is a table: name one of its keys",
+        ),
         ("version=2", "--set version=2: version 2; this release reads 1"),
     ],
 )

@@ -210,11 +210,11 @@ def test_what_is_made_up_is_said_to_be(folder, monkeypatch, call):
     (folder / "robot.toml").write_text(EXAMPLE)
     url = "source.whiskers.url=synthetic:mouse"
     _, said, _ = call("config", "check", "robot.toml", "--set", url)
-    assert said.endswith("source whiskers is made up: what is decided on it means nothing\n")
+    assert said.endswith("source whiskers is made up: decisions on it mean nothing\n")
     _, said, _ = call("config", "check", "robot.toml")
     assert "made up" not in said
     _, _, err = call("run", "--source", "synthetic:mouse?seconds=0.1")
-    assert err.startswith("synthetic:mouse?seconds=0.1 is made up: what is decided on it means")
+    assert err.startswith("synthetic:mouse?seconds=0.1 is made up: decisions on it mean")
 
 
 def test_a_stream_that_is_over_and_a_time_that_is_up_end_it(folder, done):
@@ -295,7 +295,7 @@ def test_what_hangs_at_the_end_is_left_behind(folder, started):
         (["run", "gone.toml"], "gone.toml: no such file"),
         (["run", "robot.toml", "--set", "page.port=0"], "page.port: expected a whole number >= 1"),
         (["config", "check", "robot.toml", "--set", "sorce=1"], "did you mean source?"),
-        (["config", "example", "robot.toml"], "robot.toml is there already"),
+        (["config", "example", "robot.toml"], "robot.toml already exists"),
         (["config", "example", "gone/robot.toml"], "no folder gone to write"),
     ],
 )

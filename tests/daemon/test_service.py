@@ -66,7 +66,7 @@ def test_install_service_writes_all_three_and_touches_nothing_else(tmp_path, don
     assert written == {"tactile-rt.service", "99-tactile.rules", "install.sh"}
     assert f"{file}" in (tmp_path / "to" / "tactile-rt.service").read_text()
     assert "latency_timer" in (tmp_path / "to" / "99-tactile.rules").read_text()
-    assert "is there already" in refused("install-service", file, "--out", tmp_path / "to")
+    assert "already exists" in refused("install-service", file, "--out", tmp_path / "to")
     new = ("install-service", file, "--out", tmp_path / "new")
     assert "--user" in refused(*new, "--user", "a; rm -rf /")
     file.write_text("version = 2\n")

@@ -74,7 +74,7 @@ def test_sweeps_without_contact_do_not_count() -> None:
     assert fit_prediction_sets([(with_gaps, labels, names)], 1.0) == same
     silent = np.full_like(posteriors, np.nan), labels, names
     assert fit_prediction_sets([silent, (with_gaps, labels, names)], 1.0) == same
-    with pytest.raises(RecordingError, match="in no validation sweep a contact was found"):
+    with pytest.raises(RecordingError, match="no validation sweep has both a contact"):
         fit_prediction_sets([silent], 1.0)
 
 

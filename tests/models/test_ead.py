@@ -78,7 +78,7 @@ def test_the_frames_that_can_count(encoder, attender):
 
 
 def test_gpt_refuses_a_window_past_its_positions():
-    with pytest.raises(ValueError, match="5 steps, but this attender ends at 4"):
+    with pytest.raises(ValueError, match="5 steps; this attender takes at most 4"):
         GPT(32, 0.1, 4)(torch.zeros(2, 5, 32))
 
 
@@ -239,7 +239,7 @@ def test_all_steps_is_one_layer_over_the_flattened_window():
 
 def test_all_steps_ends():
     decoder, x = decoders.KINDS["mlp-all"](16, 7, 1 / 32, steps=4), features(5)
-    with pytest.raises(ValueError, match="5 steps, but this decoder ends at 4"):
+    with pytest.raises(ValueError, match="5 steps; this decoder takes at most 4"):
         decoder(x)
     state = {"decoder_sum": torch.randn(3, 32)}
     _, new = decoder.step(x[:, 4], torch.full((3,), 4), state)

@@ -125,13 +125,17 @@ def test_the_page_of_results_is_what_was_found() -> None:
         ("batch = 4", "bach = 4", "the file has no key 'bach'; did you mean batch?"),
         ("[1e-3, 1e-2]", "[]", "search needs a learning_rate and a warmup"),
         ('encoder = "gru"\nobj', 'encoder = "gru"\nshare = 2\nobj', "share must be above 0"),
-        ('encoder = "gru"\nobj', 'encoder = "gru"\nbegin = "s4"\nobj', "begins with 's4', which"),
-        ('than = "svm"', 'than = "svn"', "compares 'svn', which no cell is"),
-        ('objective = "simclr"\naugmentation = "image"', "", "two cells are 'gru'"),
+        (
+            'encoder = "gru"\nobj',
+            'encoder = "gru"\nbegin = "s4"\nobj',
+            "begins with 's4', but no earlier cell",
+        ),
+        ('than = "svm"', 'than = "svn"', "compares 'svn', but no cell has that name"),
+        ('objective = "simclr"\naugmentation = "image"', "", "two cells are named 'gru'"),
         ("[1e-3, 1e-2]", "[1e-3, -1e-2]", "cell 'gru': learning_rate must be positive"),
-        ("most = 2", "most = 0", "growth goes from 1 updates to 0, which is less"),
-        ("train = 2", "train = -1", "sweeps are counted from 0"),
-        ("clip_norm = 2", "seed = 2", "supervised: seed is what the grid itself decides"),
+        ("most = 2", "most = 0", "growth must not go from 1 updates to 0"),
+        ("train = 2", "train = -1", "sweeps must be 0"),
+        ("clip_norm = 2", "seed = 2", "supervised: seed is set by the grid itself"),
         (
             'augmentation = "image"',
             'augmentation = "image"\nbegin = "gru"\nseeds = 3',
@@ -140,7 +144,7 @@ def test_the_page_of_results_is_what_was_found() -> None:
         (
             'augmentation = "image"',
             'augmentation = "image"\noptions = { preprocessing = "paper" }',
-            "another than that of a cell before it that is called 'gru'",
+            "its network differs from that of an earlier cell that is also called 'gru'",
         ),
     ],
 )
@@ -360,7 +364,7 @@ def test_a_cell_begins_with_another_and_learns_from_fewer_objects(plan: Path) ->
     few = bench.splits_with_share(0.5)[0]
     assert set(few.sweeps.objects) == {"mug-0", "mug-1", "car-0", "car-1"}
     assert bench.splits_with_share(1.0)[0] is bench.splits[0]
-    said = "'gru simclr image' diverged, and there is nothing to begin with"
+    said = "'gru simclr image' diverged, so there is no checkpoint to begin with"
     assert bench.do(task).failed == said
     (before,) = [t for t in grid.tasks() if t.slug in grid.list_dependencies(task)]
     assert not bench.do(before).failed

@@ -103,8 +103,8 @@ def test_what_cannot_be_begun_with_is_said(sets, run, tmp_path, refused):
     wide = ("--set", "width=0.0625", *QUICK)
     for data, begin, more, said in (
         (sets / "other", tmp_path / "no.pt", (), "no checkpoint"),
-        (sets / "other", run / "best.pt", wide, "cannot be begun with: it is of another width"),
-        (tmp_path / "robot", run / "best.pt", (), "cannot be begun with: it is of another"),
+        (sets / "other", run / "best.pt", wide, "it has another width"),
+        (tmp_path / "robot", run / "best.pt", (), "training cannot begin with"),
     ):
         assert said in refused("train", data, tmp_path / "a", "--from", begin, *more)
 

@@ -73,7 +73,7 @@ def history(run):
         ({"objective": "simclr", "batch": 1}, "batch must be 2 or more"),
         ({"objective": "simclr", "pairs": "three"}, "pairs is 'three', not one of one-sweep, two"),
         ({"objective": "simclr", "temperature": 0.0}, "temperature must be positive"),
-        ({"objective": "predictive", "pairs": "two-sweeps"}, "predictive has no two views"),
+        ({"objective": "predictive", "pairs": "two-sweeps"}, "pairs needs objective simclr"),
     ],
 )
 def test_what_cannot_be_is_refused(changed, said):

@@ -242,7 +242,7 @@ def test_cells_have_the_names_that_are_known_without_torch():
 @pytest.mark.parametrize(
     ("file", "change", "said"),
     [
-        ("config.json", None, "config.json is gone, so that nobody knows what run this is"),
+        ("config.json", None, "config.json is missing, so that this run cannot be identified"),
         ("best.pt", None, r"no checkpoint .*: delete .*last.pt to begin the run anew"),
         ("best.pt", lambda b: b[:900], r"is not a checkpoint .*: delete .*last.pt to begin"),
         ("history.csv", lambda b: b"\xff\xfe", "history.csv is damaged: delete it to go on"),
@@ -322,7 +322,7 @@ def test_a_validation_without_a_touch_is_told_before_the_training(tiny, tmp_path
     monkeypatch.setattr(
         loop, "Validation", lambda config, data, *rest: Validation(config, data[:0], *rest)
     )
-    with pytest.raises(ConfigError, match="in no validation sweep was a touch found"):
+    with pytest.raises(ConfigError, match="no touch was found in the validation sweeps"):
         train(TrainingConfig(tiny, **SMALL, objective="simclr", updates=1), tmp_path / "run")
 
 

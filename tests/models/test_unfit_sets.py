@@ -67,7 +67,7 @@ def test_a_label_that_is_none(folder, unfit):
     resplit(folder, categories=("ball", "cube"), withheld=("cone",))
     assert "cone-0 of 'train' is of the withheld category 'cone', which has no label" in unfit()
     resplit(folder, categories=("ball", "cube"), withheld=())
-    assert "cone-0 is of no category it names" in unfit()
+    assert "cone-0 has a category that is not listed" in unfit()
 
 
 @pytest.mark.parametrize(

@@ -208,7 +208,9 @@ def test_an_array_of_other_files_is_copied_only_if_the_copy_finds_them(tmp_path:
     pair = tmp_path / "pair.toml"
     pair.write_text('[[animal]]\narray = "magnets.toml"\n')
     (tmp_path / "magnets.toml").write_text(MAGNETS.read_text())
-    with pytest.raises(ConfigError, match=r"pair\.toml: an \[\[animal\]\] is another file"):
+    with pytest.raises(
+        ConfigError, match=r"pair\.toml: an \[\[animal\]\] names its array by a relative"
+    ):
         new_project(tmp_path / "mine", str(pair))
     assert not (tmp_path / "mine").exists()
     pair.write_text(f'[[animal]]\narray = "{MAGNETS}"\n')

@@ -140,7 +140,7 @@ def test_shares_are_of_each_category_and_some_of_each_are_trained(night, tmp_pat
     none = write_set(tmp_path / "none", found, (1, 0, 0))
     assert not none.split["validation"] and not none.split["test"]
     for bad in ((0.5, 0.5), (0, 1, 0), (1, -1, 0), (1, np.nan, 0), (1e308,) * 3):
-        with pytest.raises(ConfigError, match="--shares is TRAIN,VALIDATION,TEST"):
+        with pytest.raises(ConfigError, match="--shares must be TRAIN,VALIDATION,TEST"):
             write_set(tmp_path / "bad", found, bad)
 
 
@@ -182,10 +182,10 @@ def test_the_longest_names_fit_into_a_file_s(night, tmp_path, letter):
 def test_recordings_and_patterns_of_other_arrays_are_refused(night, tmp_path):
     other = record_touches(tmp_path / "other.mcap", ["mug"], spec=replace(plate(1, 4), rate_hz=250))
     both = [night, other]
-    with pytest.raises(SpecMismatch, match=r"other.mcap is of another array than .*night.mcap"):
+    with pytest.raises(SpecMismatch, match=r"other.mcap has another array than .*night.mcap"):
         find_labelled(both, intervals_of_all(both))
     write_tiny_set(tmp_path / "set", spec=plate(1, 4))
-    with pytest.raises(SpecMismatch, match=r"night.mcap is of another array than .*set"):
+    with pytest.raises(SpecMismatch, match=r"night.mcap has another array than .*set"):
         find_labelled([night], intervals_of_all([night]), tmp_path / "set")
     for name, said in (("no.mcap", "no recording"), ("no.txt", "no recording")):
         with pytest.raises(ConfigError, match=said):

@@ -59,7 +59,7 @@ def test_nothing_is_appended_that_could_not_be_read(night):
         with pytest.raises(ConfigError):
             append_label(path, "night.mcap", bad)
     for bad in ("#1.mcap", "a\nb.mcap"):
-        with pytest.raises(ConfigError, match=r"cannot stand in labels.csv"):
+        with pytest.raises(ConfigError, match=r"cannot be written in labels.csv"):
             append_label(path, bad, LabelledInterval(label="mug", start_s=0, end_s=1))
     assert not path.exists()
     path.write_text("time,what\n")
@@ -93,7 +93,7 @@ def test_recordings_that_are_not_asked_for_are_kept_apart(night, tmp_path):
         (HEADER + "night.mcap,1,2,mug,../x\n", "labels.csv:2: object: '../x' cannot be part"),
         (HEADER + f"night.mcap,1,2,mug,{'漢' * 41}\n", "object: .* too long: 123 bytes, 120 at"),
         (HEADER + "nigth.mcap,1,2,mug,\n", "2: recording: no file 'nigth.mcap' .* mean night.mcap"),
-        (HEADER + "a\0b.mcap,1,2,mug,\n", r"2: recording: 'a\\x00b.mcap' is no file's name"),
+        (HEADER + "a\0b.mcap,1,2,mug,\n", r"2: recording: 'a\\x00b.mcap' is not a file name"),
         (HEADER + f"{'n' * 200_000},1,2,mug,\n", "labels.csv:2: field larger than field limit"),
     ],
 )

@@ -203,7 +203,7 @@ def test_time_that_goes_back_keeps_the_order_of_samples(tmp_path):
 
 def test_what_cannot_be_a_dataset_is_named(recording, tmp_path):
     other = write(tmp_path / "o.mcap", cut_chunks(noise(9, (2, 2)), 1000.0), small_spec(2))
-    with pytest.raises(SpecMismatch, match=r"o\.mcap is of another array"):
+    with pytest.raises(SpecMismatch, match=r"o\.mcap has another array"):
         write_dataset([recording, other], tmp_path / "set")
     with pytest.raises(RecordingError, match="has no samples"):
         write_dataset([write(tmp_path / "e.mcap", [])], tmp_path / "set")
@@ -265,7 +265,7 @@ def test_what_is_no_film_is_named(recording, tmp_path):
         with pytest.raises(ConfigError, match=said):
             film_of(text)
     one = film_of(f"front={film(tmp_path / 'a.mp4', 3)}")
-    with pytest.raises(ConfigError, match="films go with one recording"):
+    with pytest.raises(ConfigError, match="films need a single recording"):
         write_dataset([recording, recording], tmp_path / "set", films=[one])
 
 

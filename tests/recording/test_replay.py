@@ -166,7 +166,7 @@ def test_gaps_of_the_recording_are_counted_as_missing(path):
     ("options", "said"),
     [
         ("speed=-1", "speed must be 0 .* or more, not -1"),
-        ("speed=nan", "speed: nan is no quantity"),
+        ("speed=nan", "speed: nan is not a finite number"),
         ("sped=1", "no option 'sped'; did you mean speed?"),
         ("from=wires", "from must be samples or wire, not 'wires'"),
         ("from=wire", "no raw packets: .* is no device"),

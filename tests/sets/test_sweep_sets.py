@@ -194,7 +194,7 @@ def test_a_split_without_objects_or_of_unknown_ones_is_damage(folder: Path) -> N
         read_sweeps(folder, "train")
     write_object(folder, "spoon-0", sweeps_of("spoon-0"), {})
     (folder / "manifest.json").write_bytes(manifest_with(split={"train": ["mug-1", "spoon-0"]}))
-    with pytest.raises(RecordingError, match="spoon-0 is of no category"):
+    with pytest.raises(RecordingError, match="spoon-0 has a category"):
         read_sweeps(folder, "train")
 
 

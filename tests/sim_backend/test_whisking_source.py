@@ -251,7 +251,7 @@ def test_it_has_an_end_if_asked() -> None:
         ("whisking:mouse?frequency_hz=99", "frequency must be 0 to 30 Hz, not 99"),
         ("whisking:mouse?amplitude_deg=50&offset_deg=30", "leaves the range of 1.05 rad"),
         ("whisking:mouse?object=mugg", "no object called 'mugg'"),
-        ("whisking:mouse?position_mm=1,2", "position_mm is three numbers x,y,z"),
+        ("whisking:mouse?position_mm=1,2", "position_mm must be three numbers x,y,z"),
         ("whisking:mouse?size_mm=0", "size_mm must be above 0"),
         ("whisking:mouse?object=mug-1&position_mm=6,4,0", "inside the object: move it away"),
         ("whisking:mouse?amplitude=3", "has no option 'amplitude'; did you mean amplitude_deg?"),

@@ -81,7 +81,7 @@ def test_what_the_url_says_arrives(url: str, target: str, path: str) -> None:
         ("glove:a?channels=2.5", "glove:a: channels: expected a whole number, got '2.5'"),
         ("glove:a?raw=perhaps", "glove:a: raw: expected true or false, got 'perhaps'"),
         ("glove:a?gain=", "glove:a: gain: expected a number, got ''"),
-        ("glove:a?gain=1e999", "glove:a: gain: inf is no quantity"),
+        ("glove:a?gain=1e999", "glove:a: gain: inf is not a finite number"),
         ("glove:a?gain=-1", "gain must be positive, not -1.0"),
         ("glove:a?gain=1&gain=2", "option 'gain' is given twice"),
     ],

@@ -393,7 +393,7 @@ def test_a_class_may_be_a_number_and_none_is_made_of_one(tmp_path):
     assert teacher.obey("²") == "touch it: ² (1 of 2)", "which is no digit of a number"
     assert (teacher.label, teacher.wanted) == ("²", ["press", "2", "1", "²"])
     for order in ORDERS:
-        with pytest.raises(ConfigError, match="is an order to who teaches; name it otherwise"):
+        with pytest.raises(ConfigError, match="is a command of `teach`; choose another label"):
             Teacher(lesson, [order], 2)
 
 

@@ -117,7 +117,7 @@ class RangeFile(io.RawIOBase):
                 raise
             answer.release_conn()
             if len(data) != end - begin:
-                raise ConfigError(f"{len(data)} bytes came where {end - begin} were asked for")
+                raise ConfigError(f"{len(data)} bytes received, not the {end - begin} requested")
         except (ConfigError, urllib3.exceptions.HTTPError) as error:
             reason = str(getattr(error, "reason", error))  # of the last retry
             self.error = self.error or " ".join(reason.split())

@@ -228,7 +228,7 @@ def _check_keys(node: SettingNode, path: list[str | int], kind: Any, top: Any) -
             raise ConfigError(f"{below.where}: there may be several of {name}: write [[{key}]]")
         if inner is not None and not several and isinstance(below.value, list):
             name = format_path([*path, key])
-            raise ConfigError(f"{below.where}: there is but one: write [{name}]")
+            raise ConfigError(f"{below.where}: only one is allowed: write [{name}]")
     for step, below, inner in _walk_values(node, kind):
         _check_keys(below, [*path, step], inner, top)
 
@@ -251,7 +251,7 @@ def _check_finite(root: SettingNode, node: SettingNode, path: list[str | int], k
         except ValueError:
             return  # the conversion reports it with what is allowed
         if not math.isfinite(number):
-            raise refusal(root, path, f"{number} is no quantity")
+            raise refusal(root, path, f"{number} is not a finite number")
 
 
 def _find_smallest_error(

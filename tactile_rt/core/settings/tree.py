@@ -105,7 +105,7 @@ def read_text(path: Path, largest: int = LARGEST) -> str:
     if data.startswith(b"\x89MCAP"):
         raise ConfigError(f"{path} is a recording, no text: --source takes it as replay:{path}")
     if len(data) > largest:
-        raise ConfigError(f"{path}: larger than {largest >> 20} MB: not such a file")
+        raise ConfigError(f"{path}: larger than {largest >> 20} MB: too large for such a file")
     try:
         return data.decode().removeprefix("\ufeff")  # some editors write this mark first
     except UnicodeDecodeError as error:
@@ -162,7 +162,7 @@ def _build(
     node = SettingNode(made, file, line, folder)
     where = f"{node.where}: {format_path(path)}" if path else node.where
     if isinstance(value, float) and (value != value or value in (float("inf"), -float("inf"))):
-        raise ConfigError(f"{where}: {value} is no quantity")
+        raise ConfigError(f"{where}: {value} is not a finite number")
     if isinstance(value, int) and not -INT64 <= value < INT64:
         raise ConfigError(f"{where}: more than 64 bits")
     return node

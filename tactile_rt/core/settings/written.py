@@ -47,7 +47,7 @@ def set_key(nodes: SettingNode, text: str, kind: Any) -> SettingNode:
     origin = f"--set {text}"
     steps = key.split(".")
     if not equals or not all(steps):
-        raise ConfigError(f"{origin}: a setting is KEY=VALUE")
+        raise ConfigError(f"{origin}: a setting must be KEY=VALUE")
     at: Any = nodes
     path: list[str | int] = []
     for i, step in enumerate(steps):
@@ -56,7 +56,7 @@ def set_key(nodes: SettingNode, text: str, kind: Any) -> SettingNode:
             place = _find_item(at, step, origin, format_path(path))
             path.append(place)
             if last:
-                raise ConfigError(f"{origin}: {format_path(path)} is a table: say which key of it")
+                raise ConfigError(f"{origin}: {format_path(path)} is a table: name one of its keys")
             at = at.value[place]
             continue
         if not isinstance(at.value, dict):
@@ -87,7 +87,7 @@ def set_keys(
         key, equals, _ = text.partition("=")
         key = key.partition(".")[0]
         if not equals:
-            raise ConfigError(f"--set {text}: a setting is KEY=VALUE; {nearest('', known)}")
+            raise ConfigError(f"--set {text}: a setting must be KEY=VALUE; {nearest('', known)}")
         if key not in known:
             raise ConfigError(f"--set {text}: no key {key!r}; {hint(key, known)}")
         set_key(nodes, text, kind)
@@ -215,7 +215,7 @@ def read_csv(path: Path) -> CsvTable:
         raise ConfigError(f"{where}: columns are separated by semicolons; use commas")
     if len(set(columns)) < len(columns):
         twice = next(c for i, c in enumerate(columns) if c in columns[:i])
-        raise ConfigError(f"{where}: column {twice!r} is there twice; remove one")
+        raise ConfigError(f"{where}: column {twice!r} appears twice; remove one")
     rows = []
     for number, cells in below:
         if len(cells) != len(columns):

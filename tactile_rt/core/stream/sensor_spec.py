@@ -86,12 +86,12 @@ class ChannelSpec:
             raise ConfigError(f"{who}: range must be more than 0: what is its largest reading?")
         if not self.noise_density and not self.resolution:
             raise ConfigError(
-                f"{who}: give its noise_density, its resolution, or both: what is finer is not "
-                "to be believed"
+                f"{who}: needs noise_density, resolution, or both: they say how exact its readings "
+                "are"
             )
         for load, value in self.of.items():
             if load not in LOADS:
-                raise ConfigError(f"{who}: of has no {load!r}: it knows {', '.join(LOADS)}")
+                raise ConfigError(f"{who}: of has no {load!r}: there are {', '.join(LOADS)}")
             if not math.isfinite(value):
                 raise ConfigError(f"{who}: of.{load} must be finite, not {value}")
         if self.field and self.field not in FIELD:
@@ -189,8 +189,8 @@ class SensorSpec:
                 )
             if channel.field and self.matrix:
                 raise ConfigError(
-                    f"sensor: channel {channel.name!r} reads a field, which a matrix cannot say; "
-                    "remove the one or the other"
+                    f"sensor: channel {channel.name!r} reads a field, which a matrix cannot "
+                    "describe; remove one of them"
                 )
         for name, rows in self.matrix.items():
             widths = {len(row) for row in rows}

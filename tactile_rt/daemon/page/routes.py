@@ -100,11 +100,11 @@ class Guard:
             raise Refused(403, "this page is not served under that name; use its IP address")
         origin = headers.get("origin")
         if origin is not None and urlsplit_netloc(origin) != host.lower():
-            raise Refused(403, "asked for by another site")
+            raise Refused(403, "requested by another site")
         if headers.get("sec-fetch-site", "none") not in ("same-origin", "none") and (
             method != "GET" or headers.get("sec-fetch-mode") != "navigate"
         ):
-            raise Refused(403, "asked for by another site")
+            raise Refused(403, "requested by another site")
 
     def knows(self, headers: Mapping[str, str]) -> bool:
         """Return whether a request has the token or its cookie, or no token is set."""
@@ -233,10 +233,10 @@ class PageRoutes:
             return Response(200, self._stream_lines(source), "application/x-ndjson")
         only(request, "POST")
         if self._control is None:
-            raise Refused(403, "this page may only look: set control = true in [page]")
+            raise Refused(403, "this page is read-only: set control = true in [page]")
         action = (await json_body(request, _Control)).action
         if action not in ACTIONS:
-            raise Refused(400, f"the recorder knows {', '.join(ACTIONS)}")
+            raise Refused(400, f"action must be one of {', '.join(ACTIONS)}")
         if not self._control(action, request.peer):
             raise Refused(404, "nothing is recorded: there is no [recorder]")
         return Response(202, b"asked for")
@@ -254,7 +254,7 @@ class PageRoutes:
 
     async def _stream_lines(self, source: str) -> AsyncGenerator[bytes, None]:
         if len(self.clients) >= MAX_STREAMS:
-            raise Refused(503, f"{MAX_STREAMS} browsers are looking already")
+            raise Refused(503, f"{MAX_STREAMS} browsers are connected already")
         client = PageClient(source)
         self.clients.add(client)
         try:
@@ -276,7 +276,7 @@ async def json_body(request: Request, kind: Any) -> Any:
     try:
         return msgspec.json.decode(body, type=kind)
     except (msgspec.MsgspecError, UnicodeError):
-        raise Refused(400, "not what is expected here") from None
+        raise Refused(400, "the body is not the expected JSON") from None
 
 
 def only(request: Request, method: str) -> None:

@@ -81,7 +81,7 @@ class Ros2Options(SenderOptions, frozen=True, forbid_unknown_fields=True, kw_onl
             IPv4Address(self.interface)
         except ValueError:
             raise ValueError(
-                f"interface is the IPv4 address of one, like 127.0.0.1, not {self.interface}"
+                f"interface must be an IPv4 address, like 127.0.0.1, not {self.interface}"
             ) from None
 
 

@@ -44,10 +44,10 @@ class ZenohOptions(ListenerOptions, frozen=True, forbid_unknown_fields=True, kw_
         for endpoint in (*self.listen, *self.connect):
             protocol, slash, address = endpoint.partition("/")
             if not (protocol.isalnum() and slash and address):
-                raise ValueError(f"an endpoint is like tcp/127.0.0.1:7447, not {endpoint}")
+                raise ValueError(f"an endpoint must be like tcp/127.0.0.1:7447, not {endpoint}")
             port = _split_port(address)
             if protocol in ON_PORTS and port != "0" and not is_port(port):
-                raise ValueError(f"{endpoint}: a port is a number from 0 to 65535, not {port}")
+                raise ValueError(f"{endpoint}: a port must be from 0 to 65535, not {port}")
         if not (self.listen or self.connect or self.scouting or self.config_file):
             raise ValueError("no peer could be reached: give listen, connect, scouting or a file")
 

@@ -42,7 +42,7 @@ class ZmqOptions(ListenerOptions, frozen=True, forbid_unknown_fields=True, kw_on
             )
         port = rest.rpartition(":")[2]
         if scheme == "tcp" and port != "*" and not is_port(port):
-            raise ValueError(f"bind: a port is a number from 1 to 65535, or *, not {port}")
+            raise ValueError(f"bind: a port must be from 1 to 65535, or *, not {port}")
         if not 1 <= self.queue <= 1_000_000:
             raise ValueError(f"queue must be from 1 to 1000000, not {self.queue}")
 

@@ -63,10 +63,7 @@ class AsciiLineOptions:
 
     def __post_init__(self) -> None:
         if bool(self.mapping) == bool(self.columns):
-            raise ConfigError(
-                "ascii_line has to know its columns: give either mapping=FILE.toml or "
-                "columns=A0.fx,A0.fy"
-            )
+            raise ConfigError("ascii_line needs either mapping=FILE.toml or columns=A0.fx,A0.fy")
 
 
 def _has_digit(word: str) -> bool:
@@ -370,7 +367,7 @@ def _find_names(columns: tuple[Column, ...], where: str) -> Names | None:
         return None
     if len(labels) != len(columns):
         given = [c.label for c in columns]
-        why = [f"{name!r} stands there twice" for name in labels if given.count(name) > 1]
+        why = [f"{name!r} appears twice" for name in labels if given.count(name) > 1]
         why.append("give all columns a name, NAME=COLUMN, or none")
         raise ConfigError(f"{where}: {why[0]}")
     return Names(labels)

@@ -181,7 +181,7 @@ def parse_column(word: str, where: str) -> Column:
     if found := _WHOLE.fullmatch(word):
         bits = int(found[2] or 32)
         if not 1 <= bits <= MOST_BITS:
-            raise ConfigError(f"{where}: a counter has 1 to {MOST_BITS} bits, not {bits}")
+            raise ConfigError(f"{where}: a counter must have 1 to {MOST_BITS} bits, not {bits}")
         return Column(found[1].removeprefix("time:"), bits=bits)
     if word == "time:days":
         return Column("s", scale=86_400.0, offset=-86_400.0 * 25_569)  # days from 1899 to 1970
@@ -219,11 +219,11 @@ def array_of(mapping: ArrayTable, columns: tuple[Column, ...], where: str) -> Ar
     seen = set()
     for c in values:
         if (c.element, c.channel) in seen:
-            raise ConfigError(f"{where}: {c.element}.{c.channel} stands there twice")
+            raise ConfigError(f"{where}: {c.element}.{c.channel} appears twice")
         seen.add((c.element, c.channel))
         if units.setdefault(c.channel, c.unit) != c.unit:
             raise ConfigError(
-                f"{where}: {c.element}.{c.channel} is in {c.unit}, another {c.channel} in "
+                f"{where}: {c.element}.{c.channel} is in {c.unit}, but another {c.channel} in "
                 f"{units[c.channel]}"
             )
     for element, channel in product(elements, units):
@@ -233,10 +233,10 @@ def array_of(mapping: ArrayTable, columns: tuple[Column, ...], where: str) -> Ar
             )
     for what, kinds in (("count", ["count"]), ("time", ["s", "iso", "ms", "us", "ns"])):
         if sum(c.kind in kinds for c in columns) > 1:
-            raise ConfigError(f"{where}: {what} stands there twice")
+            raise ConfigError(f"{where}: {what} appears twice")
     for name in mapping.elements:
         if name not in elements:
-            raise ConfigError(f"{where}: no column is of elements.{name}")
+            raise ConfigError(f"{where}: elements.{name} has no column")
     poses = [mapping.elements.get(e, Element()) for e in elements]
     try:
         return ArraySpec(

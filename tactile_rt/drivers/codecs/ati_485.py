@@ -251,7 +251,7 @@ def _read_matrix(path: str) -> NDArray[np.float64] | None:
         raise ConfigError(f"{path}: not a table of numbers ({error})") from None
     table: NDArray[Any] = np.array(numbers)
     if table.size != 36:
-        raise ConfigError(f"{path}: a calibration has 6 x 6 numbers, not {table.size}")
+        raise ConfigError(f"{path}: a calibration must have 6 x 6 numbers, not {table.size}")
     table = table.reshape(6, 6)
     if not np.isfinite(table).all() or np.linalg.matrix_rank(table) < 6:
         raise ConfigError(f"{path}: the calibration matrix is singular")

@@ -46,8 +46,7 @@ class BinaryFrameOptions(FrameOptions):
     def __post_init__(self) -> None:
         if not self.mapping:
             raise ConfigError(
-                "binary_frame has to know the frame: give mapping=FILE.toml, as "
-                "docs/codecs/binary_frame.toml"
+                "binary_frame needs mapping=FILE.toml, as docs/codecs/binary_frame.toml"
             )
 
 

@@ -231,8 +231,8 @@ class _Reader:
                 largest = abs(gain[-1]) * 2.0 ** (0 if found.real else found.length) + abs(bias[-1])
                 if not largest < LARGEST:
                     raise ConfigError(
-                        f"{where}, channel {channel.name}: by the factor and offset of signal "
-                        f"{found.name} its readings go up to {largest:.3g}, as no sensor's do"
+                        f"{where}, channel {channel.name}: factor and offset of signal "
+                        f"{found.name} give readings up to {largest:.3g}, more than any sensor's"
                     )
         roles = [
             self._find_integer(what, getattr(file, what)) for what in ("counter", "time", "status")
@@ -296,7 +296,7 @@ class _Reader:
         outer = signal
         while outer.multiplexer_signal:
             if len(chain) == DEEPEST:
-                raise ConfigError(f"{self.dbc}: {name} is within {DEEPEST} multiplexers, or itself")
+                raise ConfigError(f"{self.dbc}: {name} is nested in {DEEPEST} multiplexers or more")
             chain.append((outer.multiplexer_signal, frozenset(outer.multiplexer_ids)))
             outer = known[outer.multiplexer_signal]
         self.used[owner, signal_name] = tuple(chain)
@@ -307,7 +307,7 @@ class _Reader:
             return None
         _, signal = self._find_signal(f"{self.path}, {what}", entry.signal)
         if signal.real:
-            raise ConfigError(f"{self.path}, {what}: {entry.signal} must be of whole numbers")
+            raise ConfigError(f"{self.path}, {what}: {entry.signal} must have whole numbers")
         return signal
 
     def _make_parts(self) -> tuple[FramePart, ...]:

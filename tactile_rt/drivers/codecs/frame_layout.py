@@ -158,7 +158,7 @@ class FrameLayout:
         self.ends = _parse_hex(mapping.ends, f"{path}: ends") if mapping.ends else b""
         self.usually = _parse_hex(mapping.usually, f"{path}: usually")
         if not self.sync and not self.ends:
-            raise ConfigError(f"{path}: give the bytes that each frame begins with, or ends: sync")
+            raise ConfigError(f"{path}: needs sync: the bytes that begin or end each frame")
         if self.usually and not self.usually.startswith(self.sync):
             raise ConfigError(f"{path}: usually must begin with sync")
         taken: dict[int, str] = {}
@@ -169,7 +169,7 @@ class FrameLayout:
                 if not 0 <= at < length:
                     raise ConfigError(f"{path}: {what} reaches byte {at}; a frame has {length}")
                 if at in taken:
-                    raise ConfigError(f"{path}: byte {at} is of {taken[at]} and of {what}")
+                    raise ConfigError(f"{path}: byte {at} belongs to both {taken[at]} and {what}")
                 taken[at] = what
 
         def place(one: FrameCounter, what: str) -> Numbers:
@@ -186,7 +186,7 @@ class FrameLayout:
         self.meanings: dict[int, str] = {}
         for bit, meaning in (mapping.status.bits if mapping.status else {}).items():
             if not (bit.isdecimal() and self.status and int(bit) < self.status.bits):
-                raise ConfigError(f"{path}: status.bits: {bit!r} is no bit of it")
+                raise ConfigError(f"{path}: status.bits: {bit!r} is not a bit of status")
             self.meanings[int(bit)] = meaning
         self.spec, self.blocks = self._lay_out_values(path, take)
         self.begun = self.ended_otherwise = 0
@@ -225,7 +225,7 @@ class FrameLayout:
             if len(scales) == 1:
                 scales *= len(values.channels)
             if len(scales) != len(values.channels):
-                raise ConfigError(f"{path}: {where}: scale: one for all channels, or one for each")
+                raise ConfigError(f"{path}: {where}: scale must be one number, or one per channel")
             if not (all(scales) and np.isfinite((*scales, values.offset)).all()):
                 raise ConfigError(f"{path}: {where}: scale must be numbers other than 0")
             by_channel = dict(zip(values.channels, scales, strict=True))
@@ -249,7 +249,7 @@ class FrameLayout:
             for column in columns:
                 if column.element not in spec.elements:
                     raise ConfigError(
-                        f"{path}: values[{k}]: nothing is measured of {column.element}"
+                        f"{path}: values[{k}]: {column.element} has no measured column"
                     )
             rows = [spec.elements.index(c.element) for c in columns]
             blocks.append(Block(values, numbers, gain, bias, cells, rows))

@@ -31,7 +31,7 @@ class Checksum(_Table, frozen=True, kw_only=True):
     """Table ``[checksum]``: the checksum of a frame.
 
     Attributes:
-        at: Offset of the checksum; -1 for the last bytes before `ends`.
+        at: Offset of the checksum; -1: directly before `ends`, or else at the end of the frame.
         first: Offset of the first byte that it covers.
         order: Byte order of the checksum; empty for that of the file.
     """

@@ -335,7 +335,7 @@ class SampleParts:
         self._low = low
 
     def _close(self, batch: SampleBatch) -> None:
-        """Add the open sample to `batch`, complete or not, unless it fails its check."""
+        """Add the open sample, unless no part came or, if complete, its checksum is wrong."""
         head, self._head = self._head, None
         if head is None:
             return

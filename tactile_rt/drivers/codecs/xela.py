@@ -24,7 +24,7 @@ class XelaOptions:
     """Options of a uSkin patch.
 
     Attributes:
-        board: Number of the controller board, from 1.
+        board: Number of the controller board, 0 to 255; its commands have CAN id 0x200 + board.
         first_id: CAN identifier of the first taxel; the others follow in order.
         rate_hz: Rate at which the patch sends samples, Hz.
     """

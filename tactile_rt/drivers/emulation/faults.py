@@ -95,18 +95,20 @@ class Fault:
             if not 0 <= getattr(self, name) < math.inf:
                 raise ConfigError(f"{name} must be 0 or more, not {getattr(self, name)}")
         if (self.rate > 0) == (self.at_s is not None):
-            raise ConfigError("give either rate, per second, or at_s, once")
+            raise ConfigError(
+                "give either rate (faults per second) or at_s (time of a single fault)"
+            )
         if self.at_s is not None and not QUIET_S <= self.at_s < math.inf:
             raise ConfigError(
                 f"at_s must be {QUIET_S} or more (undisturbed before), not {self.at_s}"
             )
         if self.duration_s and not kind.lasts:
-            raise ConfigError(f"duration_s: {self.kind} has none")
+            raise ConfigError(f"{self.kind} takes no duration_s")
         if kind.lasts and self.kind not in FOR_EVER and not self.duration_s:
             raise ConfigError(f"duration_s must be more than 0 for {self.kind}")
         if self.amount is not None:
             if not kind.unit:
-                raise ConfigError(f"amount: {self.kind} has none")
+                raise ConfigError(f"{self.kind} takes no amount")
             if not math.isfinite(self.amount):
                 raise ConfigError(f"amount must be a number, not {self.amount}")
             if kind.whole and (self.amount < 1 or self.amount % 1):

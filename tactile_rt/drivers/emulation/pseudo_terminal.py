@@ -334,7 +334,7 @@ class Pty:
         if self.link.is_symlink() and not self.link.exists():
             self.link.unlink()  # left by a device that no longer exists
             return
-        raise ConfigError(f"{self.link} is there already: name another link, or remove it")
+        raise ConfigError(f"{self.link} already exists: name another link, or remove it")
 
 
 def _read_speed(master: int) -> int:

@@ -97,7 +97,7 @@ class GPT(nn.Module):
         """
         steps = features.shape[1]
         if steps > self.max_steps:
-            raise ValueError(f"{steps} steps, but this attender ends at {self.max_steps}")
+            raise ValueError(f"{steps} steps; this attender takes at most {self.max_steps}")
         # (batch, step, token of the step, width)
         x = self._project(features) + self.positions[: TOKENS * steps].unflatten(0, (steps, TOKENS))
         x = F.dropout(x.flatten(1, 2), self.dropout, self.training)  # (batch, token, width)

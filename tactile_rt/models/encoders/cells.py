@@ -243,5 +243,5 @@ def make_cell(name: str, channels: int) -> Cell:
     base = name.removesuffix("-ln")
     found = packages.import_addition(packages.CELLS, base)
     if not (isinstance(found, type) and issubclass(found, Cell)):
-        raise ConfigError(f"cell {base}: {found} is no class of encoders.cells.Cell")
+        raise ConfigError(f"cell {base}: {found} is not a subclass of encoders.cells.Cell")
     return found(channels, layer_norm=name != base)

@@ -90,12 +90,12 @@ class Graph:
         names = [part.name for part in parts]
         for part in parts:
             if not part.name.isidentifier() or names.count(part.name) > 1:
-                raise ConfigError(f"{part.name!r} must be a name of its own, of letters and digits")
+                raise ConfigError(f"{part.name!r} must be a unique name of letters and digits")
             if part.channels < 1:
-                raise ConfigError(f"{part.name}: channels is {part.channels}, must be at least 1")
+                raise ConfigError(f"{part.name}: channels must be at least 1, not {part.channels}")
         if self.frame.rows < 1 or self.frame.columns < 1:
             sites = f"{self.frame.rows} x {self.frame.columns}"
-            raise ConfigError(f"{self.frame.name}: {sites} sites, must be at least 1 x 1")
+            raise ConfigError(f"{self.frame.name}: sites must be at least 1 x 1, not {sites}")
         for node in self.nodes:
             _check_node(node, names)
         if self.readout not in {node.name for node in self.nodes if node.kind == "dense"}:
@@ -120,7 +120,10 @@ class Graph:
                     sizes[node.name] = _shrink(node, rows, columns)
         for node in self.nodes:
             if node.name not in sizes:
-                raise ConfigError(f"{node.name}: reads no map, but is {node.kind!r}; make it dense")
+                raise ConfigError(
+                    f"{node.name}: kind {node.kind!r} needs a map as input, but it reads only "
+                    "vectors; use kind dense"
+                )
         for node in self.nodes:
             maps = {sizes[e.source] for e in node.reads} - {(1, 1)}
             fits = node.kind == "dense" or {_shrink(node, *m) for m in maps} == {sizes[node.name]}
@@ -186,7 +189,7 @@ def _check_node(node: Node, names: list[str]) -> None:
             raise ConfigError(f"{node.name}: {what} is {value!r}, not one of {name_some(known, 8)}")
     sources = [edge.source for edge in node.reads]
     if not sources or node.reads[0].fusion != "concatenate":
-        raise ConfigError(f"{node.name}: the first edge that it reads must be concatenated")
+        raise ConfigError(f"{node.name}: its first edge must be 'concatenate'")
     if len(set(sources)) < len(sources):
         raise ConfigError(f"{node.name}: reads the same node twice")
 

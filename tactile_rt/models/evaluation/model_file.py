@@ -150,7 +150,7 @@ def _read_test(data: Path, card: ModelCard, model: Path, quick: bool) -> SweepSe
     differences = card.array.differences(test.manifest.spec, ignore=("name", "rate_hz"))
     if differences:
         raise SpecMismatch(
-            f"{model} was made for another array than {data} is of: " + "; ".join(differences)
+            f"{model} was made for another array than that of {data}: " + "; ".join(differences)
         )
     if test.manifest.period_ns != card.period_ns:
         raise ConfigError(

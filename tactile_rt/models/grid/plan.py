@@ -267,36 +267,36 @@ def _check_grid(grid: Grid) -> None:
         raise ConfigError("search needs a learning_rate and a warmup")
     if growth.most < growth.first:
         span = f"{growth.first} updates to {growth.most}"
-        raise ConfigError(f"growth goes from {span}, which is less")
+        raise ConfigError(f"growth must not go from {span}")
     if min(grid.sweeps.train, grid.sweeps.validation, grid.sweeps.test) < 0:
-        raise ConfigError("sweeps are counted from 0, which takes all")
+        raise ConfigError("sweeps must be 0 (all) or more")
     convert(make_node(grid.probe, "probe", 0, Path()), ProbeConfig)
     tables = {"supervised": grid.supervised, "self_supervised": grid.self_supervised}
     tables |= {f"options of cell {cell.name!r}": cell.options for cell in grid.cells}
     own = {f"options of cell {cell.name!r}": OWN[:4] for cell in grid.cells if cell.recipe}
     for table, fields in tables.items():
         if taken := [key for key in fields if key in own.get(table, OWN)]:
-            raise ConfigError(f"{table}: {name_some(taken)} is what the grid itself decides")
+            raise ConfigError(f"{table}: {name_some(taken)} is set by the grid itself")
     if "data" in grid.probe:
-        raise ConfigError("probe: data is what the grid itself decides")
+        raise ConfigError("probe: data is set by the grid itself")
     before: dict[str, Candidate] = {}
     untrained: dict[str, Candidate] = {}
     for cell in grid.cells:
         if cell.name in before:
-            raise ConfigError(f"two cells are {cell.name!r}")
+            raise ConfigError(f"two cells are named {cell.name!r}")
         _check_cell(grid, cell, before)
         bare = grid.make_untrained(cell)
         if untrained.setdefault(cell.network, bare) != bare:
             raise ConfigError(
-                f"cell {cell.name!r}: the network is another than that of a cell before it that "
-                f"is called {cell.network!r} too: give one a width"
+                f"cell {cell.name!r}: its network differs from that of an earlier cell that is "
+                f"also called {cell.network!r}: give one a width"
             )
         before[cell.name] = cell
     known = {task.name for task in grid.tasks()}
     for question in grid.questions:
         for one in (name for pair in question.pairs for name in (pair.better, pair.than)):
             if one not in known:
-                raise ConfigError(f"{question.text!r} compares {one!r}, which no cell is")
+                raise ConfigError(f"{question.text!r} compares {one!r}, but no cell has that name")
 
 
 def _check_cell(grid: Grid, cell: Candidate, before: dict[str, Candidate]) -> None:
@@ -304,10 +304,14 @@ def _check_cell(grid: Grid, cell: Candidate, before: dict[str, Candidate]) -> No
     if not 0 < cell.share <= 1:
         raise ConfigError(f"{called}: share must be above 0, at most 1, not {cell.share}")
     if cell.seeds < 0:
-        raise ConfigError(f"{called}: seeds must be 0 (the grid's) or more, not {cell.seeds}")
+        raise ConfigError(
+            f"{called}: seeds must be 0 (the grid's number) or more, not {cell.seeds}"
+        )
     if cell.begin:
         if cell.begin not in before:
-            raise ConfigError(f"{called} begins with {cell.begin!r}, which no cell before it is")
+            raise ConfigError(
+                f"{called} begins with {cell.begin!r}, but no earlier cell has that name"
+            )
         has, wants = (one.seeds or grid.seeds for one in (before[cell.begin], cell))
         if has < wants:
             raise ConfigError(

@@ -175,7 +175,9 @@ class Workbench:
         if cell.begin:
             begun = outcomes.read_outcome(self.grid, self.folder, self.grid.find_beginning(task))
             if begun is None or begun.chosen is None:
-                raise DivergedError(f"{cell.begin!r} diverged, and there is nothing to begin with")
+                raise DivergedError(
+                    f"{cell.begin!r} diverged, so there is no checkpoint to begin with"
+                )
             begin = str(self._run_folder(self.grid.find_beginning(task), begun.chosen) / "best.pt")
         config = self.grid.config(
             task, self.data, learning_rate=at.learning_rate, warmup=at.warmup, updates=at.updates,

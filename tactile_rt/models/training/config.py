@@ -166,9 +166,9 @@ class TrainingConfig:
                 f"{self.objective} compares sweeps of a batch: batch must be 2 or more"
             )
         if self.related and not self.labelled:
-            raise ConfigError(f"names and identity are of supervised, not of {self.objective}")
+            raise ConfigError(f"names and identity need objective supervised, not {self.objective}")
         if self.pairs != ONE_SWEEP and self.objective not in ("simclr", "simsiam"):
-            raise ConfigError(f"pairs are of simclr and simsiam: {self.objective} has no two views")
+            raise ConfigError(f"pairs needs objective simclr or simsiam, not {self.objective}")
         if self.schedule == "one-cycle" and self.rate_per == "epoch":
             raise ConfigError("schedule one-cycle changes the rate per update, not per epoch")
         _check_seed(self.seed)
@@ -202,7 +202,7 @@ class TrainingConfig:
     def network(
         self, classes: int, frame: tuple[int, int, int] = MOUSE_FRAME, names: int = 0
     ) -> EADConfig:
-        """Return the configuration of a network with given numbers of classes and names.
+        """Return the network's configuration for given numbers of classes and of kinds (`names`).
 
         Raises:
             ConfigError: the network is invalid.

@@ -279,7 +279,7 @@ class Validation:
             self._found = data.onsets(data.sweeps.values)
             usable = self._usable = np.flatnonzero(self._found.start >= 0)
             if not len(usable):
-                raise ConfigError("in no validation sweep was a touch found: make more sweeps")
+                raise ConfigError("no touch was found in the validation sweeps: make more sweeps")
             self._other = np.arange(len(data.sweeps))  # the sweep of the second view
             if config.pairs == TWO_SWEEPS:
                 rng = np.random.default_rng([config.seed, VIEWS])

@@ -66,8 +66,7 @@ def build_objective(config: TrainingConfig, training: SweepSet) -> "Objective":
         objects = training.sweeps.objects
         if config.identity and len(set(objects.tolist())) == len(objects):
             raise ConfigError(
-                f"identity: no object of {config.data} has two sweeps to be told as one: make more "
-                "of each"
+                f"identity: no object of {config.data} has two sweeps: make more of each"
             )
         class_of = [manifest.categories.index(c) for c in kinds for _ in kinds[c]]
         return Supervised(
@@ -239,9 +238,10 @@ def nt_xent(first: Tensor, second: Tensor, temperature: float) -> Tensor:
 
 
 class SimCLR(Objective):
-    """SimCLR objective: contrast of two views by a neck (Linear, BN, ReLU, Linear, BN).
+    """SimCLR objective: two views of a sweep must agree after a projection head, the neck.
 
-    The neck is discarded afterwards. Both views form one batch, also for batch norms.
+    The neck (Linear, BN, ReLU, Linear, BN) is discarded after training. Both views form one batch,
+    also for batch norms.
     """
 
     views = 2
@@ -308,7 +308,9 @@ class SimSiam(Objective):
 
 
 def _distance(prediction: Tensor, target: Tensor) -> Tensor:
-    """Return the mean negative cosine similarity (batch, feature) to a target without gradient."""
+    """Return the mean negative cosine similarity. Both are (batch, feature); no gradient flows into
+    the target.
+    """
     return -F.cosine_similarity(prediction.float(), target.detach().float(), dim=1).mean()
 
 

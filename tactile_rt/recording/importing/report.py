@@ -135,7 +135,7 @@ def write_chunks(
         RecordingError: no sample is valid.
     """
     if not chunk.valid.any():
-        raise RecordingError(f"{what}: no number of a measurement in {len(chunk)} lines")
+        raise RecordingError(f"{what}: no measured number in {len(chunk)} lines")
     n, rate = len(chunk), about.spec.rate_hz
     span_s = int(chunk.t_ns[-1] - chunk.t_ns[0]) / NS_PER_S
     account.total, account.read = account.intact + account.corrupt, account.intact

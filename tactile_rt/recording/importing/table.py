@@ -98,7 +98,7 @@ def place_columns(
     if labelled and len(labelled) < len(columns):
         raise ConfigError(f"{where}: give all columns a name, NAME=COLUMN, or none")
     if labelled and not names:
-        raise ConfigError(f"{where}: the file does not name its columns: give them by their places")
+        raise ConfigError(f"{where}: the file does not name its columns: give them by position")
     if not labelled and len(columns) > len(names) > 0:
         raise ConfigError(f"{where}: {len(columns)} columns for {len(names)} of the file")
     places = [] if labelled else list(range(len(columns)))
@@ -385,7 +385,7 @@ def _make_increasing(
     ends = np.flatnonzero(steps)  # with a coarse clock several rows share a time
     forward = steps[ends] > 0
     if not forward.any():
-        raise ConfigError("all lines have one time: leave its column out, and give --rate")
+        raise ConfigError("all lines have the same time: leave its column out, and give --rate")
     stretches, repeats = int((steps < 0).sum()), int((steps == 0).sum())
     pause = GAP * np.median(steps[ends][forward])
     usual = forward & (steps[ends] <= pause)

@@ -95,7 +95,7 @@ def csv_form(
     _check_cells(path, head)
     given = NAMES.get(delimiter, delimiter)
     if len(given) > 1:
-        raise ConfigError(f"--delimiter is one character, tab or space, not {delimiter!r}")
+        raise ConfigError(f"--delimiter must be one character, tab or space, not {delimiter!r}")
     fits: list[tuple[float, CsvForm]] = []
     for one in (given,) if given else DELIMITERS:
         for comma in (decimal == ",",) if decimal else (False, True):

@@ -106,7 +106,7 @@ def _propose_table_columns(path: Path, form: CsvForm) -> ProposedColumns | None:
     unread = list_unread_units(names, words)
     summary += f"; units that are not read: {shown_names(unread)}" if unread else ""
     if not any("." in word for word in words if not word.startswith("time")):
-        none = f"no number of a measurement in {shown_names(left)}"
+        none = f"no measured number in {shown_names(left)}"
         return ProposedColumns("", True, timed, none) if left and timed else None
     for k, order in clocks.items():
         if words[k] == "time:iso" and order != "iso":

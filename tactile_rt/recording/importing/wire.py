@@ -137,7 +137,7 @@ def _prepare(
         codec.spec = read_array(Path(array))
         written["array"] = codec.spec.to_json()
     elif array:
-        raise ConfigError(f"array= is for devices that are asked what they are, not for {name}")
+        raise ConfigError(f"array= is not for codec {name}, which has its own array")
     if rate_hz and codec.spec is not None and codec.spec.rate_hz != rate_hz:
         codec.spec = replace(codec.spec, rate_hz=rate_hz)
     about = Description(
@@ -261,7 +261,7 @@ class _DecodedLog:
 def _cut_last(
     packets: Iterator[tuple[Any, int | None]], lead: bytes
 ) -> Iterator[tuple[Any, int | None]]:
-    """Yield packets, with `lead` before the first, and the last cut into single bytes."""
+    """Yield packets, `lead` before the first; cut the last `LAST` into single bytes."""
     last: deque[tuple[Any, int | None]] = deque()
     for packet, t_ns in packets:
         last.append((lead + packet if lead else packet, t_ns))

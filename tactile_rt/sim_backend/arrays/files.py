@@ -218,7 +218,7 @@ def _read_toml(path: Path, nodes: settings.SettingNode) -> tuple[WhiskerArray, .
             (file.name, file.mirror, any(file.gravity_m_s2), file.mount, file.sensor, file.defaults)
         ):
             raise ConfigError(
-                f"{path}: beside [[animal]] tables there is nothing else; name, mirror, "
+                f"{path}: beside [[animal]] tables no other keys are allowed; name, mirror, "
                 f"gravity_m_s2, mount, sensor and defaults belong in the file of an array"
             )
         animals = [_load_animal(path, animal) for animal in file.animal]
@@ -250,7 +250,7 @@ def _load_animal(path: Path, animal: _Animal) -> WhiskerArray:
     name = animal.array
     if Path(name).suffix.lower() in ARRAY_FILES:
         if (path.parent / name).resolve() == path.resolve():
-            raise ConfigError(f"{path}: an animal's array is another file, not this one")
+            raise ConfigError(f"{path}: [[animal]] array names this file itself; name another file")
         name = str(path.parent / name)
     array = load_array(name)
     return replace(array, mount=_make_mount(path, animal.mount)) if animal.mount else array

@@ -131,7 +131,7 @@ def place(arrays: Sequence[WhiskerArray]) -> tuple[WhiskerArray, ...]:
         raise ConfigError("the arrays of one world must have the same gravity_m_s2, or none")
     for k, array in enumerate(arrays):
         if array.mount in [a.mount for a in arrays[:k]]:
-            raise ConfigError(f"animal {k + 1} ({array.name}) stands in another; move its mount")
+            raise ConfigError(f"animal {k + 1} ({array.name}) overlaps another; move its mount")
     placed, above = [], 0
     for k, array in enumerate(arrays, start=1):
         whiskers = tuple(

@@ -157,7 +157,7 @@ class Whisker:
             raise ConfigError(f"no {missing[0]}; give it a value")
         name = given["whisker"]
         if not isinstance(name, str):
-            raise ConfigError(f"whisker is a name, in quotes, not {name!r}")
+            raise ConfigError(f"whisker must be a name, in quotes, not {name!r}")
         row, column = _read_integer(given, "row", 1) - 1, _read_integer(given, "col", 0)
         length = _read_number(given, "arc_length_mm")
         fields = {field: _read_number(given, at) for at, field in OPTIONAL.items() if at in given}

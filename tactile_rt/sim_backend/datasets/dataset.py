@@ -193,7 +193,7 @@ class _Work:
     def __call__(self, name: str) -> str | None:
         if not self.folder.is_dir():
             raise ConfigError(
-                f"{self.folder} is not there on every machine: a cluster needs a shared file system"
+                f"{self.folder} is not on every machine: a cluster needs a shared file system"
             )
         if has_object(self.folder, name):  # another run may have made it meanwhile
             return None

@@ -116,7 +116,7 @@ def _read_sums(folder: Path) -> dict[str, str]:
         return {name: digest for digest, name in pairs}
     except FileNotFoundError:
         raise RecordingError(
-            f"{folder} has no {SUMS}: it is unfinished, or older than they are"
+            f"{folder} has no {SUMS}: the set is unfinished (sweep again), or of an older release"
         ) from None
     except (ValueError, UnicodeDecodeError):
         raise RecordingError(f"{path} is damaged: delete it and sweep again") from None

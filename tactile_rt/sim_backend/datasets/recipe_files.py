@@ -108,4 +108,4 @@ def _make_absolute(path: str, folder: Path | None) -> str:
     try:
         return str(((folder or Path()) / Path(path).expanduser()).absolute())
     except RuntimeError:  # no such user, or one without a home
-        raise ConfigError(f"{path} is no path of a user here") from None
+        raise ConfigError(f"{path} names no user of this computer") from None

@@ -120,7 +120,9 @@ class MeshObjects:
         """Name in the folder (``category/object``), by name in the set (``category-object``)."""
         names = {name.replace("/", "-"): name for name in self._set.names}
         if len(names) < len(self._set.names):
-            raise ConfigError(f"{self.choice.source}: two objects differ by / and - alone")
+            raise ConfigError(
+                f"{self.choice.source}: names of two objects differ only by / and -: rename one"
+            )
         return names
 
     @cached_property

@@ -85,7 +85,7 @@ class Range(msgspec.Struct, frozen=True, omit_defaults=True):
             )
         if self.between and not self.between[0] <= self.between[1]:
             low, high = self.between
-            raise ConfigError(f"between has its lower end first, not {low:g}, {high:g}")
+            raise ConfigError(f"between must begin with its lower end, not {low:g}, {high:g}")
         if not 1 <= self.peak <= STEEPEST:
             raise ConfigError(f"peak must be from 1 to {STEEPEST:g}, not {self.peak:g}")
 
@@ -180,7 +180,7 @@ class ObjectChoice(msgspec.Struct, frozen=True):
         for key in ("categories", "withheld", "outliers"):
             names = getattr(self, key)
             if twice := [n for i, n in enumerate(names) if n in names[:i]]:
-                raise ConfigError(f"{key}: {twice[0]!r} is there twice; remove one")
+                raise ConfigError(f"{key}: {twice[0]!r} appears twice; remove one")
         for key, others in (("withheld", "categories"), ("outliers", "categories withheld")):
             for other in others.split():
                 if both := sorted(set(getattr(self, key)) & set(getattr(self, other))):
@@ -264,7 +264,7 @@ class SweepChoice:
         return len(self.combinations()) * (self.draws + self.held_out_draws)
 
     def draw_index(self, index: int) -> int:
-        """Return the position, from 0, of sweep `index` within its combination."""
+        """Return which draw, from 0, sweep `index` is of its combination of listed values."""
         return index % (self.draws + self.held_out_draws)
 
     def draw(self, rng: np.random.Generator, index: int, shared: np.random.Generator) -> Sweep:

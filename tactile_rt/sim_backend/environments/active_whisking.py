@@ -151,13 +151,11 @@ class ActiveWhisking(gymnasium.Env[Observation, NDArray[np.float32]]):
         if task not in ("classify", "locate"):
             raise ConfigError(f"task must be classify or locate, not {task!r}")
         if len(kinds) < 2:
-            raise ConfigError("kinds: name two or more, there is nothing to distinguish")
+            raise ConfigError("kinds must be two or more")
         for kind in kinds:
             promised_object(f"{kind}-0")  # raises if the kind does not exist
         if not 0 <= instances[0] < instances[1]:
-            raise ConfigError(
-                f"instances must be the first and the one after the last, not {instances}"
-            )
+            raise ConfigError(f"instances must be (first, one after the last), not {instances}")
         if touches < 0:
             raise ConfigError(f"touches must be 0 or more, not {touches}")
         if step_ms < FRAMES or step_ms % FRAMES:

@@ -96,7 +96,7 @@ class ArrayFinding:
 
 
 def make_estimate(value: float, error: float) -> Figure:
-    """Make a `Figure` from a value and the relative half width of its interval."""
+    """Make an estimate whose interval is `value` divided and multiplied by 1 + `error`."""
     return Figure(value, value / (1 + error), value * (1 + error))
 
 

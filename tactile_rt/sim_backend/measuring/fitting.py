@@ -156,7 +156,7 @@ def _measure_whiskers(
 def _measure_rate(recorded: Chunk) -> Figure:
     """Measure the sample rate, Hz: the slope of sample numbers over time stamps."""
     if len(recorded) < LEAST:
-        raise ConfigError(f"the recording has {len(recorded)} samples: {LEAST} are the least")
+        raise ConfigError(f"the recording has {len(recorded)} samples; at least {LEAST} are needed")
     count = int(recorded.seq[-1] - recorded.seq[0]) + 1
     if len(recorded) < (1 - MISSING) * count:
         raise ConfigError(

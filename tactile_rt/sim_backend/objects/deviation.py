@@ -88,7 +88,7 @@ class TriangleSurface:
         self._tree = cKDTree(self.middles)
 
     def about(self, points: Floats) -> Floats:
-        """Estimate distances (n,) of points (n, 3), some too large by at most `reach`."""
+        """Estimate distances (n,) of points (n, 3): never too small, at most `reach` too large."""
         _, near = self._tree.query(points, k=np.arange(1, min(NEAR, len(self.tiles)) + 1))
         best: Floats = np.min([_find_gaps(self.tiles[tile], points) for tile in near.T], axis=0)
         return best

@@ -111,8 +111,8 @@ def read_list(name: str) -> tuple[ListedObject, ...]:
         packaged = file.repository.split("/")[0] in PACKAGES
         if packaged != (len(file.commit) < 40):
             raise ConfigError(
-                f"{row.where}: commit is a version of a package of {' or '.join(PACKAGES)}, and "
-                f"of 40 digits elsewhere, not {file.commit!r}"
+                f"{row.where}: commit must be a version for a package of {' or '.join(PACKAGES)}, "
+                f"and 40 digits elsewhere, not {file.commit!r}"
             )
         if ".." in parts or file.path.startswith("/"):
             raise ConfigError(f"{row.where}: {file.path!r} leads out of its repository")
@@ -123,7 +123,7 @@ def read_list(name: str) -> tuple[ListedObject, ...]:
         except ValueError:
             scale = math.nan
         if not 0 < scale < math.inf:
-            raise ConfigError(f"{row.where}: scale is a number of metres, not {file.scale!r}")
+            raise ConfigError(f"{row.where}: scale must be a number of metres, not {file.scale!r}")
     ordered = sorted(files, key=lambda f: (f.category, f.name))
     grouped = groupby(ordered, key=lambda f: (f.category, f.name))
     return tuple(ListedObject(tuple(group)) for _, group in grouped)
@@ -161,7 +161,7 @@ def get_objects(
             if not path.exists():
                 _save_object(thing, path, clones)
             elif row and row.source != thing.files[0].repository:
-                raise ConfigError(f"{path} is of {row.source}: choose another folder")
+                raise ConfigError(f"{path} comes from {row.source}: choose another folder")
         except ConfigError as error:
             missing[thing.name] = str(error)
         progress(thing.name)
@@ -188,7 +188,7 @@ def _save_object(thing: ListedObject, path: Path, clones: Path | None) -> None:
             found = hashlib.sha256(content).hexdigest()
             if found != file.sha256:
                 raise ConfigError(
-                    f"{file.repository}/{file.path}: is not what the list means (sha256 "
+                    f"{file.repository}/{file.path}: is not the listed file (sha256 "
                     f"{found[:12]}... instead of {file.sha256[:12]}...)"
                 )
             parts.append(Path(place) / f"{number}{Path(file.path).suffix}")
@@ -210,7 +210,7 @@ def _download(file: ListedFile) -> bytes:
             content: bytes = answer.read()
     except (OSError, urllib.error.URLError) as error:
         raise ConfigError(
-            f"{url}: cannot be got ({error}); clone {file.repository} and say --clones"
+            f"{url}: cannot be downloaded ({error}); clone {file.repository} and say --clones"
         ) from None
     return content
 

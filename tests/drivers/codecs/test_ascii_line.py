@@ -209,13 +209,13 @@ def test_any_numbers_with_any_separators(rows, gaps, end):
 
 BAD_COLUMNS = [
     ("A0fx", "columns[0]: 'A0fx' is no column: write ELEMENT.CHANNEL"),
-    ("A0.fx,A0.fx", "columns: A0.fx stands there twice"),
+    ("A0.fx,A0.fx", "columns: A0.fx appears twice"),
     ("A0.fx,A1.fy", "columns: no column A0.fy; every element needs every channel"),
     ("A0.fx:ozf", "columns[0]: unknown unit 'ozf'; there are N, mN"),
     ("A0.fx*big", "columns[0]: scale must be a number other than 0, not 'big'"),
-    ("count:99,A0.fx", "columns[0]: a counter has 1 to 53 bits, not 99"),
-    ("count,A0.fx,count", "columns: count stands there twice"),
-    ("A0.fx:mN,A1.fx:mT", "columns: A1.fx is in T, another fx in N"),
+    ("count:99,A0.fx", "columns[0]: a counter must have 1 to 53 bits, not 99"),
+    ("count,A0.fx,count", "columns: count appears twice"),
+    ("A0.fx:mN,A1.fx:mT", "columns: A1.fx is in T, but another fx in N"),
     ("count,-", "columns: no column measures anything"),
     ("time*2:ms,A0.fx", "columns[0]: 'time*2:ms' is no column"),
 ]
@@ -234,7 +234,7 @@ BAD_FILES = [
     ('columns = ["A0.fx"]\nrate_hz = -1.0', " array 'ascii_line': rate_hz must be positive"),
     ('columns = ["A0.fx", "A0:fy"]', " columns[1]: 'A0:fy' is no column"),
     ('columns = ["A0.fx"]\nversion = 2', "2: version: this release reads 1, not 2"),
-    ('columns = ["A0.fx"]\n[elements.B1]', " no column is of elements.B1"),
+    ('columns = ["A0.fx"]\n[elements.B1]', " elements.B1 has no column"),
     (
         'columns = ["A0.fx"]\n[elements.A0]\ngrid = [0]',
         "3: elements.A0.grid: expected a list of 2 whole numbers, got",
@@ -256,9 +256,9 @@ def test_bad_files_are_named(tmp_path: Path, text: str, message: str) -> None:
 
 
 def test_other_mistakes_are_named() -> None:
-    with pytest.raises(ConfigError, match="give either mapping=FILE"):
+    with pytest.raises(ConfigError, match="needs either mapping=FILE"):
         AsciiLineOptions()
-    with pytest.raises(ConfigError, match="give either mapping=FILE"):
+    with pytest.raises(ConfigError, match="needs either mapping=FILE"):
         AsciiLineOptions(mapping="a.toml", columns="A0.fx")
     with pytest.raises(ConfigError, match="rate_hz must be positive, not -1"):
         AsciiLine(AsciiLineOptions(columns="A0.fx", rate_hz=-1.0))

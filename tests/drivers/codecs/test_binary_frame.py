@@ -195,22 +195,22 @@ def test_checksums_are_the_published_ones(name, check, tmp_path):
 
 
 MISTAKES = [
-    ("at = 21", "at = 20", r"byte 20 is of checksum and of values\[1\]"),
-    ("at = 17", "at = 21", r"byte 21 is of checksum and of values\[1\]"),
+    ("at = 21", "at = 20", r"byte 20 belongs to both checksum and values\[1\]"),
+    ("at = 17", "at = 21", r"byte 21 belongs to both checksum and values\[1\]"),
     ("length = 24", "length = 19", r"reaches byte \d+; a frame has 19"),
     ('"crc16_modbus"', '"crc17"', r"checksum 'crc17' is not known; there are sum8, .*crc32"),
     ('"A5 5A"', '"A5 5"', r"sync: write bytes in hexadecimal, AA 07, not 'A5 5'"),
     ("5A\"\nends = \"0D\"", "5A\"\nusually = \"A5 5B\"", r"usually must begin with sync"),
-    ('sync = "A5 5A"\nends = "0D"', "", r"bytes that each frame begins with, or ends"),
+    ('sync = "A5 5A"\nends = "0D"', "", r"bytes that begin or end each frame"),
     ('elements = ["A0", "A1", "B0", "B1"]   #', "elements = [2, 2, 2]  #", r"rows \(26 at most\)"),
     ('elements = ["A0", "A1", "B0", "B1"]   #', "elements = [2, 101]  #", r"100 columns at most"),
     ('unit = "kPa"', 'unit = "torr"', r"values\[1\]: unknown unit 'torr'; there are N, mN"),
     ("scale = 0.5", "scale = 0", r"values\[1\]: scale must be numbers other than 0"),
-    ("scale = 0.5", "scale = [1.0, 2.0]", r"scale: one for all channels, or one for each"),
+    ("scale = 0.5", "scale = [1.0, 2.0]", r"scale must be one number, or one per channel"),
     ('type = "uint8"\nelements', 'type = "uint9"\nelements', r":\d+: values\[1\]\.type"),
-    ('channels = ["fx"]', 'channels = ["pressure"]', r"A0\.pressure stands there twice"),
+    ('channels = ["fx"]', 'channels = ["pressure"]', r"A0\.pressure appears twice"),
     ('"B1"]\nchannels = ["pressure"]', '"B2"]\nchannels = ["pressure"]', r"no column B1.pressure"),
-    ("0 = \"it cal", "9 = \"it cal", r"status.bits: '9' is no bit of it"),
+    ("0 = \"it cal", "9 = \"it cal", r"status.bits: '9' is not a bit of status"),
     ("tick_us = 10.0", "tick_us = 0", r"time.tick_us: expected a number > 0"),
     ("length = 24", "length = 24\nspeed = 3", r"no key 'speed'"),
     ('send = "A5 45"', 'send = "begin"', r"stop: write bytes in hexadecimal"),
@@ -228,7 +228,7 @@ def test_a_mistake_is_one_line_that_names_the_file_and_the_key(old, new, said, t
 
 
 def test_without_a_mapping_it_says_what_to_give():
-    with pytest.raises(ConfigError, match=r"give mapping=FILE.toml"):
+    with pytest.raises(ConfigError, match=r"needs mapping=FILE.toml"):
         BinaryFrameOptions()
 
 

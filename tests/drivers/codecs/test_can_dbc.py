@@ -279,7 +279,7 @@ def test_a_factor_that_no_sensor_has_is_named(folder: Path, factor: str, offset:
     assert wrong != dbc
     (folder / "patch.dbc").write_text(wrong)
     (folder / "patch.toml").write_text(PATCH_TOML)
-    with pytest.raises(ConfigError, match=r"signal X its readings go up to .* as no") as caught:
+    with pytest.raises(ConfigError, match=r"signal X give readings up to .* more than") as caught:
         CanDbc(CanDbcOptions(str(folder / "patch.toml")))
     assert "\n" not in str(caught.value)
 

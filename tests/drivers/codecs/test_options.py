@@ -8,7 +8,7 @@ from tactile_rt.drivers.opening import make_codec
 WRONG = [
     ("serial anyskin", "magnetometers", "0", "magnetometers must be 1 to 64, not 0"),
     ("serial hx711_whisker", "whiskers", "10", "whiskers must be 1 to 9, not 10"),
-    ("serial hx711_whisker", "rate_hz", "inf", "rate_hz: inf is no quantity"),
+    ("serial hx711_whisker", "rate_hz", "inf", "rate_hz: inf is not a finite number"),
     ("serial mlx_hex", "gain", "8", "gain must be 0 to 7, not 8"),
     ("serial mlx_hex", "resolution", "4", "resolution must be 0 to 3, not 4"),
     ("serial mlx_hex", "hallconf", "1", "hallconf must be 12 or 0, not 1"),

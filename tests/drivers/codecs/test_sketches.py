@@ -171,7 +171,7 @@ def test_a_missing_number_costs_its_element_and_not_the_sample() -> None:
     "text, message",
     [
         ("columns = ['x=A0.fx', 'A0.fy']", "give all columns a name, NAME=COLUMN, or none"),
-        ("columns = ['x=A0.fx', 'x=A0.fy']", "'x' stands there twice"),
+        ("columns = ['x=A0.fx', 'x=A0.fy']", "'x' appears twice"),
         ("columns = ['=A0.fx']", "columns[0]: '=A0.fx' has no name before ="),
     ],
 )

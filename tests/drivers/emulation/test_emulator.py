@@ -267,12 +267,12 @@ def test_a_schedule_unplugs_and_replugs(tmp_path: Path) -> None:
 
 def test_a_name_that_is_taken_is_not_taken_away(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("mine")
-    with pytest.raises(ConfigError, match="file is there already: name another link"):
+    with pytest.raises(ConfigError, match="file already exists: name another link"):
         native(1, endpoint=SerialEndpoint(tmp_path / "file")).start()
     with pytest.raises(ConfigError, match="No such file or directory"):
         native(1, endpoint=SerialEndpoint(tmp_path / "no" / "port")).start()
     with native(1, endpoint=SerialEndpoint(tmp_path / "port")):
-        with pytest.raises(ConfigError, match="port is there already"):
+        with pytest.raises(ConfigError, match="port already exists"):
             native(1, endpoint=SerialEndpoint(tmp_path / "port")).start()
 
 
@@ -494,7 +494,7 @@ def test_fakes_are_opened_by_their_url(fake_serial: Any, fake_can: Any) -> None:
             assert source.spec == SPEC
             assert np.array_equal(concatenate(read_chunks(source, 300)).values, values)
     assert bus_device.port == "virtual:mine" and slcan_device.port.startswith("slcan:/dev/pts/")
-    with pytest.raises(ConfigError, match="a signal is"):
+    with pytest.raises(ConfigError, match="a signal must be"):
         FakeSerial(np.zeros(3))
     with pytest.raises(ConfigError, match="no can codec 'nativ'"):
         FakeCan(values, "nativ")

@@ -267,7 +267,7 @@ def test_columns_of_a_file_are_with_their_places(tmp_path, table):
         ("1,2\n2,3\n", "t=time:s,x=S.fz", "does not name its columns"),
         ("t,Fx\n1,2\n2,3\n", "Fx=S.fx", "no column is a time: give --rate"),
         ("t,Fx\n1,2\n2,3\n", "Fx=S", "'S' is no column"),
-        ("t,Fx\n1,2\n1,3\n", "t=time:s,Fx=S.fx", "one time: leave its column out, and give"),
+        ("t,Fx\n1,2\n1,3\n", "t=time:s,Fx=S.fx", "the same time: leave its column out, and give"),
         ("t,x\n05/10/2024 09:48:16 AM,2\n", "t=time:iso,x=S.x:1", "'05/10/2024 09:.* is no time"),
         ("1,2\n2,3\n", "time:s,S.fx,S.fy,S.fz", "no line has the 4 columns"),
         ("hello, world\nhow, are you\n", "time:s,S.fx", "is no table of numbers"),

@@ -133,7 +133,7 @@ def test_cut_anywhere_and_damaged_nothing_raises_and_nothing_is_half_written(tmp
         ({"codec": "botta"}, "no serial codec 'botta'"),
         ({"codec": "bota", "sink": "9"}, "no option 'sink'"),
         ({"codec": "xela"}, "codec xela speaks over can:"),
-        ({"codec": "bota", "array": "x.json"}, "array= is for devices that are asked"),
+        ({"codec": "bota", "array": "x.json"}, "array= is not for codec bota"),
         ({}, "--as needs codec=NAME"),
     ],
 )

@@ -166,7 +166,7 @@ def test_animals_in_one_world_have_names_and_cells_of_their_own() -> None:
 
 def test_animals_are_not_put_in_the_same_place() -> None:
     mouse = load_array("mouse")
-    assert "animal 2 (mouse-right) stands in another" in refusal(place, [mouse, mouse])
+    assert "animal 2 (mouse-right) overlaps another" in refusal(place, [mouse, mouse])
     assert "must be finite" in refusal(Mount, (0.0, np.nan, 0.0), (0.0, 0.0, 0.0))
 
 
@@ -295,16 +295,22 @@ def test_a_toml_array_has_a_mount_and_defaults(tmp_path: Path) -> None:
         ),
         (DEFAULTS + WHISKERS + "frction = 3", r"a.toml:22: whisker\[1\] has no key .* friction\?"),
         (WHISKERS, r"whisker\[0\] \(A0\): no curvature_a_per_mm"),
-        (DEFAULTS + WHISKERS.replace('"A1"', "1"), r"whisker\[1\]: whisker is a name, in quotes"),
+        (
+            DEFAULTS + WHISKERS.replace('"A1"', "1"),
+            r"whisker\[1\]: whisker must be a name, in quotes",
+        ),
         (
             DEFAULTS + WHISKERS.replace('"A1"', '"A0"'),
             r"\[1\] \(A0\): whisker A0 is .* \(line 12: whisker",
         ),
         ("[[animal]]\narray = 'mouse'\n" + WHISKERS, "tables, one of the two"),
-        ("name = 'x'\n[[animal]]\narray = 'mouse'", "there is nothing else"),
-        ("[[animal]]\narray = 'a.toml'", "another file, not this one"),
+        ("name = 'x'\n[[animal]]\narray = 'mouse'", "no other keys are allowed"),
+        ("[[animal]]\narray = 'a.toml'", "names this file itself"),
         ("[[animal]]\narray = 'no.csv'", "no.csv: no such file"),
-        ("[[animal]]\narray = 'rat'\n[[animal]]\narray = 'rat'", "a.toml: animal 2 .* in another"),
+        (
+            "[[animal]]\narray = 'rat'\n[[animal]]\narray = 'rat'",
+            "a.toml: animal 2 .* overlaps another",
+        ),
     ],
 )
 def test_a_mistake_in_a_toml_file_is_one_line(tmp_path: Path, text: str, said: str) -> None:

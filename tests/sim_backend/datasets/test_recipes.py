@@ -287,8 +287,14 @@ def test_a_recipe_of_ones_own(tmp_path: Path) -> None:
             r":2: sweeps.yaw_deg: expected a number or a table, got \[0, 90\]",
         ),
         ("[sweeps]\nyaw_deg = { between = [0] }", r"sweeps.yaw_deg: expected a number, \{ between"),
-        ("[sweeps]\nyaw_deg = { each = [nan] }", r"sweeps.yaw_deg.each\[0\]: nan is no quantity"),
-        ("[sweeps]\nyaw_deg = { between = [9, 1] }", "between has its lower end first, not 9, 1"),
+        (
+            "[sweeps]\nyaw_deg = { each = [nan] }",
+            r"sweeps.yaw_deg.each\[0\]: nan is not a finite number",
+        ),
+        (
+            "[sweeps]\nyaw_deg = { between = [9, 1] }",
+            "between must begin with its lower end, not 9, 1",
+        ),
         ("[sweeps]\nsize_mm = 1e300", "sweeps: size_mm must be 0.001 to 10000, not 1e[+]300"),
         ("length_ms = 1e12", "length_ms must be at most 600000, not 1e[+]12"),
         ("[objects]\nper_category = 1000000000", "per_category must be at most 100000, not 1e"),
@@ -297,7 +303,7 @@ def test_a_recipe_of_ones_own(tmp_path: Path) -> None:
             "sweeps: speed_mm_s must be 0.001 to 3000, not -3",
         ),
         ("[sweeps]\ndraws = 0", "sweeps: draws must be at least 1, not 0"),
-        ("[objects]\ncategories = ['a', 'a']", "objects: categories: 'a' is there twice"),
+        ("[objects]\ncategories = ['a', 'a']", "objects: categories: 'a' appears twice"),
         ("[objects]\ncategories = ['mug']\nwithheld = ['mug']", "'mug' is also one of the cat"),
         ("[objects]\nfrom = 'varied-shape'", r"no such folder 'varied-shape'; did you mean varied"),
         ("[faults]\ndead_row = 2", "dead_row must be between 0 and 1, not 2"),
@@ -387,7 +393,9 @@ def test_a_folder_names_each_object_once(folder, monkeypatch: pytest.MonkeyPatch
     folder({"a": 3, "a-b": 3})
     monkeypatch.setattr(FakeFolder, "names", ("a/b", "a-b"), raising=False)
     monkeypatch.setattr(FakeFolder, "__init__", lambda self, sizes: None)
-    with pytest.raises(ConfigError, match="two objects differ by / and - alone"):
+    with pytest.raises(
+        ConfigError, match="names of two objects differ only by / and -: rename one"
+    ):
         _ = choose_objects(ObjectChoice(source="meshes")).split
 
 

@@ -173,7 +173,7 @@ def test_whiskers_that_jam_cut_an_episode_short(monkeypatch: pytest.MonkeyPatch)
     ("wrong", "said"),
     [
         ({"task": "guess"}, "task must be classify or locate"),
-        ({"kinds": ("mug",)}, "kinds: name two or more"),
+        ({"kinds": ("mug",)}, "kinds must be two or more"),
         ({"instances": (3, 3)}, "instances must be"),
         ({"step_ms": 12}, "step_ms must be a multiple of 5"),
         ({"whiskers": ("C2", "Z9")}, "has no whisker Z9"),

@@ -313,4 +313,4 @@ def test_a_check_goes_on_past_what_cannot_be_read_and_draws_the_others(tmp_path,
     code, said, err = call("objects", "check", folder.parent, *(["--plot", out] if plot else []))
     assert code == 1 and "names vertex 9" in err and said.split()[-1] == "kind/arrow"
     assert out.exists() == plot and (not plot or out.read_bytes().startswith(b"\x89PNG"))
-    assert "is a .png" in call("objects", "check", folder.parent, "--plot", "sheet.pdf")[2]
+    assert "must be a .png" in call("objects", "check", folder.parent, "--plot", "sheet.pdf")[2]

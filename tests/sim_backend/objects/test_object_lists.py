@@ -107,7 +107,7 @@ def test_a_second_list_takes_nothing_away_of_the_first(shapes, tmp_path: Path, c
     second = listed(tmp_path / "second.csv", rows)
     code, out, err = call("objects", "get", second, tmp_path / "got", "--clones", clones)
     assert code == 1
-    assert "box/brick.ply is of some/shapes: choose another folder" in out + err
+    assert "box/brick.ply comes from some/shapes: choose another folder" in out + err
     both = open_objects(tmp_path / "got").origins
     assert first.items() <= both.items() and both.keys() - first.keys() == {"box/other"}
 
@@ -152,7 +152,8 @@ def test_objects_are_fetched(shapes, tmp_path: Path, monkeypatch: pytest.MonkeyP
     server.shutdown()
     server.server_close()
     assert (
-        list(why) == ["chair/one"] and "seat.obj: cannot be got (HTTP Error 404" in why["chair/one"]
+        list(why) == ["chair/one"]
+        and "seat.obj: cannot be downloaded (HTTP Error 404" in why["chair/one"]
     )
     assert (tmp_path / "again" / "box" / "brick.ply").exists()
 
@@ -164,7 +165,7 @@ def test_a_file_that_is_not_what_the_list_means_is_not_used(shapes, tmp_path, ca
     back.write_bytes(kept + b" ")
     code, out, err = call("objects", "get", wanted, tmp_path / "got", "--clones", clones)
     assert code == 1 and out.startswith("1 of 2 objects")
-    assert "some/shapes/meshes/the back.stl: is not what the list means (sha256 " in err
+    assert "some/shapes/meshes/the back.stl: is not the listed file (sha256 " in err
     assert not (tmp_path / "got" / "chair").exists()
     back.write_bytes(kept)  # and it goes on with what is missing
     (tmp_path / "got" / "box" / "brick.ply").write_bytes(b"kept")
@@ -179,10 +180,10 @@ def test_a_file_that_is_not_what_the_list_means_is_not_used(shapes, tmp_path, ca
         ({"name": "../up"}, "category and name may hold no /"),
         ({"sha256": "abc"}, "sha256"),
         ({"up": "x"}, "up"),
-        ({"scale": "big"}, "scale is a number of metres, not 'big'"),
-        ({"scale": "inf"}, "scale is a number of metres, not 'inf'"),
-        ({"commit": "1.8-1"}, "commit is a version of a package of debian or pypi"),
-        ({"repository": "pypi/shapes"}, "commit is a version of a package of debian or pypi"),
+        ({"scale": "big"}, "scale must be a number of metres, not 'big'"),
+        ({"scale": "inf"}, "scale must be a number of metres, not 'inf'"),
+        ({"commit": "1.8-1"}, "commit must be a version for a package of debian or pypi"),
+        ({"repository": "pypi/shapes"}, "commit must be a version for a package of debian or pypi"),
     ],
 )
 def test_a_wrong_row_is_named(tmp_path: Path, change: dict[str, str], said: str) -> None:
