@@ -1,13 +1,15 @@
-"""Atomic writing of files and folders, and refusal of paths that are no regular files."""
+"""Atomic writing and sync of files and folders; refusal of paths that are no regular files."""
 
 import errno
 import os
 import secrets
 import shutil
 import stat
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from queue import SimpleQueue
 from typing import BinaryIO, Final, cast
 
 from tactile_rt.core.errors import ConfigError
@@ -74,6 +76,32 @@ def sync_folder(folder: Path) -> None:
             raise
     finally:
         os.close(handle)
+
+
+class Syncer:
+    """Thread that runs queued sync jobs one after another.
+
+    Data that the operating system holds outlives the process, but not a power cut: only a sync puts
+    it on the medium. On a memory card that may take seconds, so a separate thread syncs.
+    """
+
+    def __init__(self) -> None:
+        self._jobs: SimpleQueue[Callable[[], object] | None] = SimpleQueue()
+        self._thread = threading.Thread(target=self._run, name="tactile-rt-sync", daemon=True)
+        self._thread.start()
+
+    def add(self, job: Callable[[], object]) -> None:
+        """Queue a job to run in the thread after all earlier jobs. It must not raise."""
+        self._jobs.put(job)
+
+    def close(self) -> None:
+        """Wait until all queued jobs are done, then end the thread."""
+        self._jobs.put(None)
+        self._thread.join()
+
+    def _run(self) -> None:
+        while (job := self._jobs.get()) is not None:
+            job()
 
 
 def write_whole(path: Path, write: Callable[[BinaryIO], object]) -> None:

@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
 
+from tactile_rt.core.files import Syncer
 from tactile_rt.core.packages import VERSION
 from tactile_rt.daemon.config import RecorderConfig
 from tactile_rt.daemon.consumer import Consumer, View
@@ -45,8 +46,7 @@ from tactile_rt.recording.layout import (
     samples_in,
 )
 from tactile_rt.recording.rotation import Rotation
-from tactile_rt.recording.syncing import Extent, Syncer
-from tactile_rt.recording.writer import RecordingWriter
+from tactile_rt.recording.writer import Extent, RecordingWriter
 
 FLUSH_S = 0.4  # with the gathering, well under the second that may be lost
 LINGER_NS = 10**9  # after a source's end, for decisions about its last samples

@@ -15,12 +15,12 @@ from typing import Any, Self
 
 from tactile_rt.core.bounded_queue import BoundedQueue
 from tactile_rt.core.errors import ConfigError, RecordingError
+from tactile_rt.core.files import Syncer
 from tactile_rt.core.stream import Chunk, Source
 from tactile_rt.drivers.device_source import device_of
 from tactile_rt.recording.description import describe
 from tactile_rt.recording.layout import SAMPLES, WIRE, Packet, encode_packet, encode_samples
 from tactile_rt.recording.rotation import Rotation
-from tactile_rt.recording.syncing import Syncer
 from tactile_rt.recording.writer import RecordingWriter, WriterStats
 
 WAKE_S = 0.05  # period of the thread, and so the largest delay of writing

@@ -23,12 +23,12 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, BinaryIO, Literal
+from typing import Any, BinaryIO, Literal, NamedTuple
 
 import msgspec
 
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.files import sync_folder
+from tactile_rt.core.files import Syncer, sync_folder
 from tactile_rt.core.stream import Source
 from tactile_rt.drivers.device_source import device_of
 from tactile_rt.drivers.health import Health
@@ -44,10 +44,17 @@ from tactile_rt.recording.layout import HEALTH, SAMPLES, WIRE, Packet, encode_pa
 from tactile_rt.recording.ros2 import messages
 from tactile_rt.recording.ros2.cdr import schema_text, token
 from tactile_rt.recording.ros2_form import ARRAY, CHANNELS, PREFIX, put_in_form
-from tactile_rt.recording.syncing import Extent, Syncer
 
 SEQUENCES = 1 << 32
 PART = ".mcap.part"  # ending of the name of a file without a complete description
+
+
+class Extent(NamedTuple):
+    """Numbers of samples and packets in a recording up to some moment."""
+
+    samples: int = 0
+    packets: int = 0
+    newest_ns: int = 0  # host monotonic time of the newest sample, ns; 0 without a sample
 
 
 class McapFile:

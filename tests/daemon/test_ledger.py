@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 from types import SimpleNamespace
 
 from tactile_rt.daemon.ledger import Ledger
-from tactile_rt.recording.syncing import Extent
+from tactile_rt.recording.writer import Extent
 
 
 @dataclass(eq=False)
