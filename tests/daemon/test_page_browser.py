@@ -1,18 +1,11 @@
 """The page in a real Chromium: live, alone, by itself back after a restart, and deaf to markup."""
 
-import shutil
 import threading
 import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
-
-pytest.importorskip(
-    "playwright.sync_api", reason="needs playwright (165 MB): pip install playwright"
-)
-
-from playwright.sync_api import sync_playwright
 
 from bench.daemon.process import free_port
 from tactile_rt.classifier.classifier import Classification
@@ -21,55 +14,19 @@ from tactile_rt.daemon.items import Decision, Event, Opened, SourceChunk
 from tactile_rt.daemon.page import Page
 from tactile_rt.daemon.states import Diagnostic, ModelState, PartState, Snapshot, SourceState
 from tactile_rt.testing import ArraySource, cut_chunks, small_spec
+from tests.helpers.browser import MARKS, Tab, open_browser
 from tests.helpers.daemons import load_checked, running_daemon
 
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-ARGS = ["--no-sandbox", "--disable-gpu", "--disable-background-networking"]
-PATIENCE_MS = 30_000
 TOKEN = "correct horse battery"
 EVIL = "<img src=x onerror=\"document.title='owned'\">"
 
-pytestmark = [
-    pytest.mark.browser,
-    pytest.mark.skipif(CHROMIUM is None, reason="needs chromium: apt-get install chromium"),
-]
+pytestmark = MARKS
 
 
 @pytest.fixture(scope="module")
 def chromium():
-    with sync_playwright() as p:
-        browser = p.chromium.launch(executable_path=CHROMIUM, args=ARGS)
+    with open_browser() as browser:
         yield browser
-        browser.close()
-
-
-class Tab:
-    """A page in the browser, and what it asked for and complained of."""
-
-    def __init__(self, browser, **options):
-        self.context = browser.new_context(**options)
-        self.page = self.context.new_page()
-        self.page.set_default_timeout(PATIENCE_MS)
-        self.asked, self.said = [], []
-        self.page.on("request", lambda request: self.asked.append(request.url))
-        self.page.on("console", lambda message: self.said.append(message.text))
-        self.page.on("pageerror", lambda error: self.said.append(f"uncaught: {error}"))
-
-    def has(self, expression):
-        # Not wait_for_function: the page's policy forbids what that evaluates inside the page.
-        end = time.monotonic() + PATIENCE_MS / 1000
-        while not self.page.evaluate(expression):
-            assert time.monotonic() < end, (expression, self.said)
-            self.page.wait_for_timeout(50)
-
-    def text(self, selector):
-        return self.page.locator(selector).text_content()
-
-    def faults(self):
-        """Of the page itself; a connection that is refused is the daemon's restart."""
-        return [
-            s for s in self.said if "uncaught" in s or "Content Security" in s or "Trusted" in s
-        ]
 
 
 @pytest.fixture
