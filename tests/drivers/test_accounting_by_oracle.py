@@ -163,14 +163,3 @@ def test_the_receivers_book_agrees_with_the_devices(bits, stamped):
         assert device.sent + device.twice == whole, seed
         numbers = dict.fromkeys(s.number for s in device.wire)
         assert kept == list(numbers), seed  # every gap is where it was, and as long
-
-
-def test_a_gap_within_one_stamp_is_a_loss():
-    stats = SourceStats()
-    sequencer = Sequencer(16, stats, float(PERIOD))
-    values, valid = np.arange(4, dtype=np.float32).reshape(4, 1, 1), np.ones((4, 1), np.bool_)
-    zeros = np.zeros(4, np.int64)
-    count, ticks = np.array([7, 8, 12, 13]), np.full(4, 5000)
-    seq, keep = sequencer.number(Samples(values, valid, zeros, zeros, count, ticks))
-    assert keep.all() and seq.tolist() == [0, 1, 5, 6]
-    assert (stats.missing, sequencer.resets) == (3, 0)
