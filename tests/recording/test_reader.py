@@ -1,7 +1,6 @@
 """What is read is what was written, or named."""
 
 import time
-from contextlib import closing
 
 import numpy as np
 import pytest
@@ -9,7 +8,6 @@ from mcap.writer import Writer
 
 from tactile_rt.core.errors import ConfigError, RecordingError
 from tactile_rt.recording import Recording, recover
-from tactile_rt.sources.opening import open_source
 from tactile_rt.testing import cut_chunks
 from tests.helpers.hostile_files import MCAPS
 from tests.helpers.measured import measured
@@ -69,14 +67,6 @@ def test_what_is_no_recording_is_named(make, kind, said, path):
             read(path)
         assert "\n" not in str(caught.value)
         assert str(path) in str(caught.value)
-
-
-def test_readers_may_stop_early(path):
-    write(path, cut_chunks(noise(100), 1000.0))
-    with closing(Recording(path).chunks()) as chunks:
-        next(chunks)
-    with open_source(f"replay:{path}") as source:
-        source.read()
 
 
 def test_a_recording_is_read_as_often_as_one_likes(path):

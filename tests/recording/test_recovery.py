@@ -169,15 +169,6 @@ def test_what_only_has_the_mark_of_a_piece_is_passed_over(whole, tmp_path):
     assert all_parts(Recording(recover(path))) == all_parts(chunks[:15])
 
 
-@pytest.mark.parametrize("left", [b"", bytes(5000)])
-def test_a_name_without_anything_is_told_in_one_line(left, tmp_path):
-    path = tmp_path / "empty.mcap"
-    path.write_bytes(left)
-    with pytest.raises(RecordingError, match=re.escape(str(path))):
-        recover(path)
-    assert list(tmp_path.iterdir()) == [path]
-
-
 @pytest.mark.parametrize("use", [recover, Recording])
 def test_what_is_no_file_is_refused_and_not_waited_for(use, tmp_path):
     path = tmp_path / "a.mcap"

@@ -42,15 +42,6 @@ def test_raw_bytes_are_what_the_codec_finds_at_its_rate(tmp_path, name):
     assert (again.equal, again.differing) == (len(chunk), 0) and again.time_ns <= 1000
 
 
-def test_half_a_file_is_imported_with_a_note(tmp_path):
-    whole = b"".join(wire_of(make_codec("serial", "bota", {})))
-    (tmp_path / "raw.bin").write_bytes(whole)
-    assert imported(tmp_path / "raw.bin", tmp_path / "o.mcap", codec="bota")[0].notes == []
-    (tmp_path / "raw.bin").write_bytes(whole[: 20 * 37 + 11])
-    made, _ = imported(tmp_path / "raw.bin", tmp_path / "o.mcap", codec="bota")
-    assert made.samples == 20 and made.notes == ["it ends with 11 bytes of no whole sample"]
-
-
 def test_a_rate_is_the_recordings(tmp_path):
     codec = make_codec("serial", "anyskin", {})
     (tmp_path / "raw.bin").write_bytes(b"".join(wire_of(codec)))
