@@ -9,13 +9,10 @@ from base64 import b64encode
 
 import numpy as np
 import pytest
-from rosbags.rosbag1 import Writer as Ros1Writer
-from rosbags.rosbag2 import StoragePlugin
-from rosbags.rosbag2 import Writer as Ros2Writer
-from rosbags.typesys import Stores, get_typestore
 
 from tactile_rt.core.stream import concatenate
 from tactile_rt.recording import Recording
+from tests.recording.importing.test_bag import FORMS, bag
 
 N = 20
 TIMES = [k / 100 for k in range(N)]  # s
@@ -24,9 +21,9 @@ FY = [-0.25 * k for k in range(N)]
 COLUMNS = "time:s,A.fx:N,A.fy:N"
 
 
-def rows(line, *, header="", times=TIMES, digits="{:.4f}"):
+def rows(line, *, header="", digits="{:.4f}"):
     """A table of time, fx and fy; `line` joins three texts."""
-    told = [[digits.format(x) for x in row] for row in zip(times, FX, FY, strict=True)]
+    told = [[digits.format(x) for x in row] for row in zip(TIMES, FX, FY, strict=True)]
     return header + "".join(line(*row) + "\n" for row in told)
 
 
@@ -52,21 +49,6 @@ TABLES = {
         ["--columns", COLUMNS],
     ),
     "exponents": ("a.csv", rows(joined(","), digits="{:.6E}"), ["--columns", COLUMNS]),
-    "milliseconds": (
-        "a.csv", rows(joined(","), times=[1e3 * t for t in TIMES]),
-        ["--columns", "time:ms,A.fx:N,A.fy:N"],
-    ),
-    "since 1970": (
-        "a.csv", rows(joined(","), times=[1_715_334_496 + t for t in TIMES]), ["--columns", COLUMNS]
-    ),
-    "dates": (
-        "a.csv",
-        "".join(
-            f"2024-05-10 09:48:{16 + t:06.3f},{x},{y}\n"
-            for t, x, y in zip(TIMES, FX, FY, strict=True)
-        ),
-        ["--columns", "time:iso,A.fx:N,A.fy:N"],
-    ),
     "no time": (
         "a.csv", "".join(f"{x},{y}\n" for x, y in zip(FX, FY, strict=True)),
         ["--columns", "A.fx:N,A.fy:N", "--rate", "100"],
@@ -149,34 +131,11 @@ def test_a_log_of_a_bus_is_read(done, tmp_path, name):
         assert np.diff(whole.t_ns) == pytest.approx(1e7, abs=2e4)
 
 
-def wrench_bag(folder, form):
-    """A bag of so many wrenches, at 100 Hz by their headers' times."""
-    store = get_typestore(Stores.ROS1_NOETIC if form == "ros1" else Stores.ROS2_HUMBLE)
-    if form == "ros1":
-        path, writer, seq = folder / "a.bag", Ros1Writer(folder / "a.bag"), {"seq": 0}
-    else:
-        path, seq = folder / "a", {}
-        writer = Ros2Writer(path, version=9, storage_plugin=StoragePlugin[form.upper()])
-    serialize = store.serialize_ros1 if form == "ros1" else store.serialize_cdr
-    kind = store.types["geometry_msgs/msg/WrenchStamped"]
-    wrench, vector = (store.types[f"geometry_msgs/msg/{n}"] for n in ("Wrench", "Vector3"))
-    header, time = store.types["std_msgs/msg/Header"], store.types["builtin_interfaces/msg/Time"]
-    with writer:
-        topic = writer.add_connection("/ft/wrench", kind.__msgtype__, typestore=store)
-        for k in range(N):
-            stamp = time(sec=UTC + k // 100, nanosec=k % 100 * 10_000_000)
-            head = header(**seq, stamp=stamp, frame_id="tool0")
-            load = wrench(force=vector(x=0.5 * k - 3, y=-0.25 * k, z=1.0), torque=vector(0, 0, -k))
-            message = serialize(kind(header=head, wrench=load), kind.__msgtype__)
-            writer.write(topic, UTC * 10**9 + k * 10_000_000 + 777, message)
-    return path
-
-
-@pytest.mark.parametrize("form", ["ros1", "sqlite3", "mcap"])
+@pytest.mark.parametrize("form", FORMS)
 def test_a_bag_is_read(done, tmp_path, form):
     out = tmp_path / "out.mcap"
-    said, _ = done("import", wrench_bag(tmp_path, form), out)
+    said, _ = done("import", bag(tmp_path, form), out, "--topic", "/ft/wrench")
     whole = concatenate(list(Recording(out)))
-    assert whole.values[:, 0].tolist() == [[0.5 * k - 3, -0.25 * k, 1, 0, 0, -k] for k in range(N)]
-    assert np.diff(whole.t_ns).tolist() == [10_000_000] * (N - 1)
-    assert f"{N} intact, 0 corrupt, 0 missing" in said
+    assert whole.values[:, 0].tolist() == [[0.5 * k, 1, 2, 3, 4, -k] for k in range(60)]
+    assert np.diff(whole.t_ns).tolist() == [10_000_000] * 59
+    assert "60 intact, 0 corrupt, 0 missing" in said
