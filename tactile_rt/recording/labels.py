@@ -222,7 +222,7 @@ def check_name(name: str, empty: bool = False) -> str:
     if not name:
         return "" if empty else "is empty; name what is touched"
     if name in RESERVED:
-        return f"{name!r} has a meaning of its own; name it otherwise"
+        return f"{name!r} is reserved; choose another name"
     if not name.isprintable() or name.startswith(".") or set(name) & set('/\\@:*?"<>|'):
         return f"{name!r} cannot be part of a file's name; use letters, digits, -, _ and spaces"
     if len(name) > LONGEST:

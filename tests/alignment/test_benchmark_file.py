@@ -88,7 +88,7 @@ def test_a_file_of_another_kind_says_where(path, change, message):
     [
         (lambda b: replace(b, protocol="loose"), "no protocol 'loose'"),
         (lambda b: replace(b, stimuli=b.stimuli[::-1]), "stimuli"),
-        (lambda b: replace(b, targets=b.targets[1:]), "not of the same animals"),
+        (lambda b: replace(b, targets=b.targets[1:]), "must have the same animals"),
         (
             lambda b: replace(b, targets=(replace(b.targets[0], chosen=SHORT), *b.targets[1:])),
             "an RDM has 15 entries",

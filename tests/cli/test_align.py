@@ -86,7 +86,7 @@ def test_stimuli_without_names_are_neither_gated_nor_decoded_by(call, done, tmp_
     for command, code in (("gate", 3), ("decode", 2)):
         found, out, err = call("align", command, MODEL, *benchmark)
         assert (found, out) == (code, "")
-        assert "paper.json is of protocol paper-code" in err and err.count("\n") == 1
+        assert "paper.json was built with protocol paper-code" in err and err.count("\n") == 1
     out, _ = done("align", "score", MODEL, *benchmark, "--json", "-")
     (model,) = json.loads(out)["models"]
     assert model["score"] is not None and model["turing"] == model["turing_why"] == ""
@@ -117,7 +117,7 @@ def test_a_mistake_of_ours_is_no_verdict(call, monkeypatch):
     def broken(*_):
         raise ZeroDivisionError
 
-    monkeypatch.setattr("tactile_rt.alignment.fidelity.fidelity_check", broken)
+    monkeypatch.setattr("tactile_rt.alignment.fidelity.check_fidelity", broken)
     code, out, err = call("align", "gate", MODEL, "--reference", MODEL)
     assert (code, out) == (3, "") and "ZeroDivisionError" in err
 
@@ -183,7 +183,7 @@ def test_mistakes_are_one_line(refused, frozen, tmp_path):
         (("score", MODEL, *benchmark, "--out", tmp_path / "x" / "p.html"), "no folder"),
         (
             ("report", frozen / "6.json", "--out", tmp_path / "p.html"),
-            "not of `tactile-rt align score",
+            "not made by `tactile-rt align score",
         ),
         (("decode", MODEL, "--stimuli", tmp_path / "none.npz"), "no file"),
     ):

@@ -131,7 +131,7 @@ def test_mistakes_are_one_line(call, lesson, tmp_path):
     folder, _ = lesson
     for arguments, said in (
         (("synthetic:3x2", tmp_path / "a", "--classes", "a/b"), "cannot be part of a file's name"),
-        (("synthetic:3x2", tmp_path / "a", "--classes", "unknown"), "has a meaning of its own"),
+        (("synthetic:3x2", tmp_path / "a", "--classes", "unknown"), "is reserved"),
         (("synthetic:3x2", tmp_path / "a", "--classes", "b,undo"), "is a command of `teach`"),
         (("synthetic:3x2", tmp_path / "a", "--page", "here"), "--page must be HOST:PORT"),
         (("synthetic:3x2", tmp_path / "a\udcff", "--classes", "a"), "is not UTF-8: rename it"),

@@ -360,7 +360,7 @@ def test_a_holder_that_listens_a_moment_later_is_named(tmp_path, monkeypatch):
 
 def test_a_holder_that_never_listens_is_a_lock_too(tmp_path):
     key = f"device {tmp_path}/tty"
-    with bound(key), pytest.raises(AlreadyRunning, match="by a process that does not tell who"):
+    with bound(key), pytest.raises(AlreadyRunning, match="by an unknown process"):
         Locks().hold([key])
 
 

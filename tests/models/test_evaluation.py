@@ -252,7 +252,7 @@ def test_noise_is_the_rated_one_and_repeats_with_its_seed() -> None:
 
 def test_a_sensor_cannot_be_better_than_ideal() -> None:
     for field in ("noise", "dead"):
-        with pytest.raises(ConfigError, match=f"{field} is -1"):
+        with pytest.raises(ConfigError, match=f"{field} must be .*, not -1"):
             replace(Disturbance(), **{field: -1})
 
 

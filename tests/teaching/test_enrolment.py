@@ -138,7 +138,7 @@ def test_an_object_cannot_have_a_name_with_a_meaning(network, tmp_path):
     lesson = Lesson.on(tmp_path / "mine", network)
     assert Teacher(lesson, [], 3).obey("list") == "nothing is taught yet"
     for name in (NONE_OF_THESE, "list", "rename me", "forget"):
-        with pytest.raises(ConfigError, match="name it otherwise"):
+        with pytest.raises(ConfigError, match="choose another"):
             check_label(name)
     with pytest.raises(ConfigError, match="there is no 'cup'"):
         lesson.rename("cup", "mug")
