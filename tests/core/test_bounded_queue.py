@@ -122,14 +122,15 @@ def test_room_is_made_by_a_reader_and_nobody_waits_for_a_closed_one(full):
     made.get()
     waited.join(PATIENCE_S)
     assert not waited.is_alive()
-    for _ in range(4):
-        made.put(("a", 1, 25))
-    made.wait_for_room(0.0)
-    waited = started(lambda: made.wait_for_room(1000.0))
-    until(lambda: made._waiting)
-    made.close()
-    waited.join(PATIENCE_S)
-    assert not waited.is_alive()
+    for wake in (made.take, made.close):
+        for _ in range(4):
+            made.put(("a", 1, 25))
+        made.wait_for_room(0.0)
+        waited = started(lambda: made.wait_for_room(1000.0))
+        until(lambda: made._waiting)
+        wake()
+        waited.join(PATIENCE_S)
+        assert not waited.is_alive()
 
 
 def test_closed_it_may_drop_what_waits():
@@ -194,15 +195,3 @@ def test_plain_items_have_no_size():
     for k in range(5):
         made.put(k)
     assert made.state.waiting_bytes == 0 and made.take() == list(range(5))
-
-
-@pytest.mark.parametrize("way", ["get", "take"])
-def test_a_writer_that_waits_for_room_is_woken_by_the_reader(way):
-    made = queue(items=2)
-    for k in range(2):
-        made.put(("a", 1, k))
-    writer = started(lambda: made.wait_for_room(2 * PATIENCE_S))
-    until(lambda: made._waiting)
-    getattr(made, way)()
-    writer.join(PATIENCE_S)
-    assert not writer.is_alive()
