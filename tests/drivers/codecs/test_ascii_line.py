@@ -236,10 +236,6 @@ BAD_FILES = [
     ('columns = ["A0.fx"]\nversion = 2', "2: version: this release reads 1, not 2"),
     ('columns = ["A0.fx"]\n[elements.B1]', " elements.B1 has no column"),
     (
-        'columns = ["A0.fx"]\n[elements.A0]\ngrid = [0]',
-        "3: elements.A0.grid: expected a list of 2 whole numbers, got",
-    ),
-    (
         'columns = ["A0.fx", "A1.fx"]\n[elements.A1]\ngrid = [0, 0]',
         " array 'ascii_line': grid repeat",
     ),
