@@ -13,23 +13,14 @@ from tactile_rt.recording import Recording, recover
 from tactile_rt.recording.reader import is_finished
 from tactile_rt.sources.opening import open_source
 from tactile_rt.testing import FakeSerial, cut_chunks
-from tests.helpers.recorder_by_hand import (
-    SPEC,
-    UTC,
-    DaemonView,
-    begun,
-    files,
-    look,
-    opened,
-    samples,
-)
+from tests.helpers.recorder_by_hand import SPEC, UTC, View, begun, files, look, opened, samples
 
 VALUES = np.random.default_rng(0).normal(size=(90, *SPEC.shape)).astype(np.float32)
 
 
 @pytest.fixture
 def daemon():
-    return DaemonView()
+    return View()
 
 
 def decision(step=1):

@@ -19,16 +19,7 @@ from tactile_rt.daemon.items import Closed, Contact, Control
 from tactile_rt.daemon.recordings_folder import RecordingsFolder
 from tactile_rt.recording import Recording, recover
 from tactile_rt.testing import cut_chunks
-from tests.helpers.recorder_by_hand import (
-    SPEC,
-    UTC,
-    DaemonView,
-    begun,
-    files,
-    look,
-    opened,
-    samples,
-)
+from tests.helpers.recorder_by_hand import SPEC, UTC, View, begun, files, look, opened, samples
 from tests.helpers.waiting import PATIENCE_S, until
 
 VALUES = np.random.default_rng(0).normal(size=(400, *SPEC.shape)).astype(np.float32)
@@ -38,7 +29,7 @@ NOBODY = 65534
 
 @pytest.fixture
 def daemon():
-    return DaemonView()
+    return View()
 
 
 @pytest.fixture

@@ -12,8 +12,8 @@ SPEC = small_spec()
 UTC = 1_700_000_000_000_000_000
 
 
-class DaemonView:
-    """What a consumer sees of it."""
+class View:
+    """What a consumer sees of its daemon."""
 
     def __init__(self):
         self.told, self.open = [], {}
