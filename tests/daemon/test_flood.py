@@ -5,8 +5,6 @@ import re
 import resource
 import signal
 import socket
-import subprocess
-import sys
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -15,12 +13,12 @@ import pytest
 from bench.daemon.process import free_port
 from tactile_rt.daemon.publishers.sending import ConnectionLimit
 from tactile_rt.recording import Recording
+from tests.helpers.processes import start_program
 from tests.helpers.waiting import PATIENCE_S, until
 
 for module in ("mcap", "zmq", "zenoh", "foxglove"):
     pytest.importorskip(module)
 
-RUN = [sys.executable, "-c", "from tactile_rt.cli import main; main()", "run"]
 CONFIG = """version = 1
 [[source]]
 name = "a"
@@ -81,7 +79,8 @@ def test_a_flood_of_connections_costs_no_sample_and_leaves_nothing(
     ports = [free_port() for _ in range(5)]
     (tmp_path / "robot.toml").write_text(CONFIG.format(*ports))
     with (tmp_path / "log").open("w") as log:
-        daemon = subprocess.Popen([*RUN, str(tmp_path / "robot.toml")], cwd=tmp_path, stderr=log)
+        options = {"cwd": tmp_path, "stdout": None, "stderr": log}
+        daemon = start_program("run", tmp_path / "robot.toml", **options)
     try:
         status = Path(f"/proc/{daemon.pid}/status")
 

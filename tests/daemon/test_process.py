@@ -7,8 +7,6 @@ import os
 import shlex
 import signal
 import socket
-import subprocess
-import sys
 import termios
 import threading
 from pathlib import Path
@@ -21,7 +19,6 @@ from tactile_rt.daemon.config import ADMISSION, EXAMPLE
 from tests.helpers.processes import run_program, start_program
 from tests.helpers.waiting import PATIENCE_S, until
 
-RUN = [sys.executable, "-c", "from tactile_rt.cli import main; main()"]
 # Sends itself a signal when it imports for the nth time since it is the daemon; 0: at each time.
 SIGNALLED = """
 import os, signal, sys
@@ -189,11 +186,10 @@ def test_a_reload_asked_for_at_every_moment_of_the_start_ends_nothing(folder):
 
 
 def test_the_example_decides_what_was_touched(tmp_path):
-    subprocess.run([*RUN, "config", "example", "robot.toml"], cwd=tmp_path, check=True)
+    run_program("config", "example", "robot.toml", cwd=tmp_path, check=True)
     port = f"page.port={free_port()}"
-    with subprocess.Popen(
-        [*RUN, "run", "robot.toml", "--set", port], cwd=tmp_path, stdout=subprocess.PIPE, text=True
-    ) as process:
+    words = ("run", "robot.toml", "--set", port)
+    with start_program(*words, cwd=tmp_path, stderr=None) as process:
         try:
             published = map(json.loads, process.stdout)
             finals = (m["label"] for m in published if m["type"] == "decision" and m["final"])
