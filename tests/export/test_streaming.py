@@ -5,13 +5,11 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-from tactile_rt.classifier.model_file import read_model, shipped_model
 from tactile_rt.export import streaming as streaming_module
-from tactile_rt.export.streaming import Pointwise, streaming
-from tests.helpers.small_networks import TOLERANCE, build, frames, stream
+from tactile_rt.export.streaming import Pointwise, Taps, streaming
+from tests.helpers.small_networks import GRAPH, TOLERANCE, build, frames, stream
 
 STEPS = 22
-SPEC = read_model(shipped_model())[0].array
 # Every cell, encoder, attender and decoder at least once; `make check-export` takes all of them.
 SAMPLE = [
     ("zhuang-timedecay", "none", "mlp"),
@@ -108,28 +106,6 @@ def test_a_step_writes_its_own_rows_of_the_cache_and_no_others() -> None:
         assert rows == [[0, 1], [8, 9], [last, last + 1], [last, last + 1]]
 
 
-GRAPH = """
-readout = "out"
-[inputs.frame]
-channels = 30
-rows = 5
-columns = 7
-[nodes.a]
-channels = 64
-kind = "valid"
-cell = "ugrnn"
-reads = ["frame"]
-[nodes.b]
-channels = 32
-kind = "same"
-reads = ["a"]
-[nodes.out]
-channels = 32
-kind = "dense"
-reads = ["b", {source = "a", fusion = "gate"}]
-"""
-
-
 def test_a_graph_with_sums_and_gates_streams_as_it_was_trained() -> None:
     ead = build("graph", "none", graph=GRAPH, width=1.0)
     x = frames()
@@ -138,8 +114,7 @@ def test_a_graph_with_sums_and_gates_streams_as_it_was_trained() -> None:
 
 @pytest.mark.usefixtures("as_if_wide")
 def test_maps_of_one_row_have_no_site_below() -> None:
-    row = GRAPH.replace("rows = 5", "rows = 1").replace('"valid"', '"same"')
-    row = row.replace('"ugrnn"', '"intersection"')
-    ead = build("graph", "none", graph=row, width=1.0, frame=(30, 1, 7))
-    x = frames()[..., :1, :]
-    assert abs(stream(streaming(ead), x) - ead(x)).max() <= TOLERANCE
+    ead = build("zhuang-intersection", "none", frame=(12, 1, 32))
+    deployed, x = streaming(ead), torch.randn(2, STEPS, 12, 1, 32)
+    assert {one.lower for one in deployed.modules() if isinstance(one, Taps)} == {None}
+    assert abs(stream(deployed, x) - ead(x)).max() <= TOLERANCE

@@ -7,6 +7,31 @@ from tactile_rt.models.ead import EAD, EADConfig
 
 STEPS = 22
 TOLERANCE = 2e-6
+# A loop of maps and a vector, joined in every way.
+GRAPH = """
+readout = "fc"
+[inputs.frame]
+channels = 30
+rows = 5
+columns = 7
+[nodes.first]
+kind = "valid"
+channels = 32
+reads = ["frame", { source = "fc", fusion = "gate" }]
+cell = "gru-ln"
+[nodes.up]
+channels = 64
+reads = ["first", "down", "fc", { source = "up", fusion = "sum" }]
+cell = "lstm-ln"
+[nodes.down]
+channels = 32
+reads = ["up", "down"]
+[nodes.fc]
+kind = "dense"
+channels = 64
+cell = "timedecay"
+reads = ["up", { source = "down", fusion = "gate" }]
+"""
 
 
 def stir(module: torch.nn.Module) -> None:

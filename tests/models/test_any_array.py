@@ -10,7 +10,7 @@ from tactile_rt.core.stream import Timing
 from tactile_rt.core.stream.sensor_spec import channel_limits
 from tactile_rt.models.ead import EAD, TactileClassifier
 from tactile_rt.models.ead_config import ENCODERS, EADConfig
-from tests.helpers.small_networks import TOLERANCE, build, stream
+from tests.helpers.small_networks import GRAPH, TOLERANCE, build, stream
 from tests.helpers.tiny_sweeps import plate
 
 GRIDS = [(6, 1, 1), (30, 2, 2), (30, 2, 4), (12, 1, 32), (15, 3, 3), (9, 10, 14), (4, 8, 1)]
@@ -58,18 +58,7 @@ def test_steps_are_about_45_ms_at_every_rate(period_ms: float, substeps: int) ->
 
 
 def test_a_graph_for_another_array_is_refused_in_one_line() -> None:
-    graph = """
-readout = "fc"
-[inputs.frame]
-channels = 30
-rows = 5
-columns = 7
-[nodes.fc]
-kind = "dense"
-channels = 32
-reads = ["frame"]
-"""
-    config = EADConfig(3, "graph", "none", graph=graph)
+    config = EADConfig(3, "graph", "none", graph=GRAPH)
     assert EAD(config)
     with pytest.raises(ConfigError, match=r"frame has 30 x 5 x 7 .* array's frames 6 x 1 x 1"):
         EAD(replace(config, frame=(6, 1, 1)))

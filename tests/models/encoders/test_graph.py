@@ -9,32 +9,7 @@ from tactile_rt.models.encoders.graph import Edge, Graph, Input, Node, parse_gra
 from tactile_rt.models.encoders.graph_encoder import GraphEncoder
 from tactile_rt.models.encoders.zhuang import zhuang_graph
 from tests.helpers.refusals import refusal
-from tests.helpers.small_networks import frames, stir
-
-TEXT = """
-readout = "fc"
-[inputs.frame]
-channels = 30
-rows = 5
-columns = 7
-[nodes.first]
-kind = "valid"
-channels = 32
-reads = ["frame", { source = "fc", fusion = "gate" }]
-cell = "gru-ln"
-[nodes.up]
-channels = 64
-reads = ["first", "down", "fc", { source = "up", fusion = "sum" }]
-cell = "lstm-ln"
-[nodes.down]
-channels = 32
-reads = ["up", "down"]
-[nodes.fc]
-kind = "dense"
-channels = 64
-cell = "timedecay"
-reads = ["up", { source = "down", fusion = "gate" }]
-"""
+from tests.helpers.small_networks import GRAPH, frames, stir
 
 
 def test_zhuangs_graph():
@@ -47,7 +22,7 @@ def test_zhuangs_graph():
 
 
 def test_a_graph_from_toml():
-    graph = parse_graph(TEXT)
+    graph = parse_graph(GRAPH)
     assert graph.lag == 2  # first -> up -> fc
     assert graph.frame == Input("frame", 30, 5, 7)
     assert graph.nodes[1].reads[3] == Edge("up", "sum")
@@ -57,7 +32,7 @@ def test_a_graph_from_toml():
 
 def test_a_frame_is_heard_two_steps_late():
     torch.manual_seed(0)
-    encoder = GraphEncoder(parse_graph(TEXT))
+    encoder = GraphEncoder(parse_graph(GRAPH))
     stir(encoder)
     x = frames(1, 6).requires_grad_()
     (gradient,) = torch.autograd.grad(encoder(x)[:, -1].square().sum(), x)
@@ -95,7 +70,7 @@ def test_fusion():
 
 
 def test_width_scales_every_node_but_not_the_frame():
-    half = parse_graph(TEXT).scale_channels(0.5)
+    half = parse_graph(GRAPH).scale_channels(0.5)
     assert [n.channels for n in half.nodes] == [16, 32, 16, 32]
     assert half.frame.channels == 30
 
@@ -135,6 +110,6 @@ def test_width_scales_every_node_but_not_the_frame():
     ],
 )
 def test_a_mistake_is_named_in_one_line(old, new, match):
-    assert old in TEXT
-    said = refusal(parse_graph, TEXT.replace(old, new, 1), "my graph")
+    assert old in GRAPH
+    said = refusal(parse_graph, GRAPH.replace(old, new, 1), "my graph")
     assert said.startswith("my graph") and re.search(match, said)
