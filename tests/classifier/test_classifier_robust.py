@@ -27,7 +27,6 @@ from tests.helpers.touch_streams import QUIET, SAME_RATE, fed_logits, push_all, 
 ONSET = QUIET + 1
 SHIPPED = load_model(shipped_model())
 FAST = SHIPPED[1].array
-SLOW = replace(FAST, rate_hz=NS_PER_S / SHIPPED[1].period_ns)
 
 
 def loads(n: int, seed: int = 0) -> np.ndarray:

@@ -48,10 +48,6 @@ def folder(tmp_path: Path) -> Path:
     return there
 
 
-def listing(folder: Path) -> list[str]:
-    return sorted(p.name for p in folder.iterdir())
-
-
 def test_what_is_written_is_read(folder: Path) -> None:
     assert SweepManifest.read(folder) == MANIFEST
     train = read_sweeps(folder, "train")

@@ -5,7 +5,6 @@ from dataclasses import replace
 import mujoco
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.integrate import quad
 from scipy.spatial.transform import Rotation
 
@@ -25,8 +24,6 @@ from tactile_rt.sim_backend.world import (
     set_damping,
 )
 from tests.helpers.beams import abscissa, compliance, line_mass
-
-Floats = NDArray[np.float64]
 
 # In the plane of the world's x and y, its base at the origin.
 FLAT = {

@@ -1,4 +1,4 @@
-"""Mamba is its equations, by a loop over every number; and a stream is the window."""
+"""Mamba is its equations, by a loop over every number."""
 
 import math
 
@@ -7,8 +7,6 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from tactile_rt.models.attenders.mamba import MambaBlock, MambaStack, selective_scan
-
-TOLERANCE = 2e-6
 
 
 def build(width: int = 32, seed: int = 1) -> MambaStack:

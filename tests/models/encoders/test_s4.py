@@ -1,4 +1,4 @@
-"""S4 is its equations, by dense matrices in double precision; and a stream is the window."""
+"""S4 is its equations, by dense matrices in double precision."""
 
 import math
 
@@ -6,18 +6,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from tactile_rt.models.encoders.s4 import S4Block, S4Encoder, hippo_legs, kernels
+from tactile_rt.models.encoders.s4 import S4Block, hippo_legs, kernels
 
 TOLERANCE = 2e-6
-
-
-def build(width: float = 1 / 16, **more) -> S4Encoder:
-    torch.manual_seed(1)
-    return S4Encoder(width, **more).eval()
-
-
-def frames(batch: int = 2, steps: int = 22) -> Tensor:
-    return torch.randn(batch, steps, 30, 5, 7, generator=torch.Generator().manual_seed(0))
 
 
 def dense(block: S4Block) -> tuple[Tensor, Tensor, Tensor]:

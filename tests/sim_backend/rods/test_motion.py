@@ -6,7 +6,6 @@ from functools import partial
 import numpy as np
 import pytest
 import trimesh
-from numpy.typing import NDArray
 
 from bench.sim.beams import flat
 from bench.sim.motion import HELD_MS, hold, release, strike
@@ -21,7 +20,6 @@ from tactile_rt.sim_backend.sweep_simulation import SweepSimulation
 from tactile_rt.sim_backend.world import PROFILES
 from tests.helpers import beams
 
-Floats = NDArray[np.float64]
 G = EARTH * 1e-3  # mm/ms^2
 ROOT = np.concatenate([np.zeros((1, 3)), np.eye(3)])[None]  # of a whisker at the origin
 
