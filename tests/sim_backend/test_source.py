@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.stream import Chunk, EndOfStream, SourceStats, concatenate
+from tactile_rt.core.stream import Chunk, SourceStats, concatenate
 from tactile_rt.recording.description import describe
 from tactile_rt.sim_backend import source as source_module
 from tactile_rt.sim_backend.arrays.files import load_array
@@ -41,19 +41,11 @@ def test_the_same_seed_gives_the_same_stream() -> None:
     assert not np.array_equal(a.values, c.values)
 
 
-def test_samples_are_numbered_and_a_millisecond_apart(two_passes: tuple[SimSource, Chunk]) -> None:
-    source, stream = two_passes
-    np.testing.assert_array_equal(stream.seq, np.arange(len(stream)))
-    np.testing.assert_array_equal(np.diff(stream.t_ns), 1_000_000)
-    assert stream.values.dtype == np.float32 and stream.values.shape[1:] == source.spec.shape
-    assert stream.valid.all() and np.isfinite(stream.values).all()
-    assert source.stats.delivered == len(stream)
-
-
 def test_loads_are_felt_only_while_an_object_passes(two_passes: tuple[SimSource, Chunk]) -> None:
     source, stream = two_passes
     assert {p.name for p in source.passes} == {"bottle-3", "gear-0"}
     assert {p.category for p in source.passes} == {"bottle", "gear"}
+    assert stream.valid.all()
     starts = [int(np.searchsorted(stream.t_ns, p.start_ns)) for p in source.passes]
     assert starts[0] == 0
     for passed, start, end in zip(source.passes, starts, [*starts[1:], len(stream)], strict=True):
@@ -71,14 +63,6 @@ def test_it_rests_after_the_last_object_so_that_its_episode_ends(
     _, stream = two_passes
     assert (stream.values[-REST_SAMPLES:] == 0).all()
     assert stream.values[-2 * REST_SAMPLES : -REST_SAMPLES].any()
-
-
-def test_it_ends_after_its_sweeps_for_good(two_passes: tuple[SimSource, Chunk]) -> None:
-    source, _ = two_passes
-    assert len(source.passes) == 2
-    for _ in range(2):
-        with pytest.raises(EndOfStream):
-            source.read()
 
 
 def test_an_object_comes_several_times_in_succession() -> None:

@@ -10,7 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.stream import Chunk, EndOfStream, Source, concatenate
+from tactile_rt.core.stream import Chunk, Source, concatenate
 from tactile_rt.drivers.codecs.native import NativeOptions, NativeSerial, frame
 from tactile_rt.drivers.codecs.native_common import IMPOSSIBLE, MessageType
 from tactile_rt.sim_backend.arrays.files import mouse_whiskers
@@ -235,13 +235,6 @@ def test_sensors_read_the_loads_poorly_and_the_angle_truly() -> None:
         assert poor.stats.missing > 50
     np.testing.assert_array_equal(read.values[..., 6], true.values[read.seq][..., 6])
     assert np.abs(read.values - true.values[read.seq])[..., 0].std() > 1e-4
-
-
-def test_it_has_an_end_if_asked() -> None:
-    source = fast(seconds=0.05)
-    assert len(concatenate(list(source))) == 50
-    with pytest.raises(EndOfStream):
-        source.read()
 
 
 @pytest.mark.parametrize(
