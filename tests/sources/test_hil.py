@@ -123,12 +123,6 @@ def test_what_cannot_be_is_refused(model: Path, further: dict, said: str) -> Non
         Loop(touches(), model, **further)
 
 
-def test_a_model_of_another_array_is_refused(model: Path) -> None:
-    other = ArraySource(small_spec(4), [])
-    with pytest.raises(SpecMismatch):
-        Loop(other, model)
-
-
 def decision(onset: int, step: int, label: str = "a", final: bool = False) -> Classification:
     shares = np.array([0.6, 0.4], np.float32)
     return Classification(onset, onset + step, step, final, label, ("a", "b"), shares, 0.0)
