@@ -128,6 +128,22 @@ def _products(count: int, wide: int, live: bool) -> Burden:
     return burden
 
 
+def no_number(nodes, tensors):  # type: ignore[no-untyped-def]
+    """Finite at rest and where all elements are loaded, as on trial; not of a touch by a few."""
+    tensors.append(numpy_helper.from_array(np.array([1], np.int64), "sub_step"))
+    tensors.append(numpy_helper.from_array(np.array(0, np.int64), "channel"))
+    tensors.append(numpy_helper.from_array(np.array(0.05, np.float32), "part"))
+    nodes.append(helper.make_node("Unsqueeze", ["offset", "sub_step"], ["base"]))
+    nodes.append(helper.make_node("Sub", ["samples", "base"], ["loads"]))
+    nodes.append(helper.make_node("Gather", ["loads", "channel"], ["of_channel"], axis=3))
+    nodes.append(helper.make_node("Abs", ["of_channel"], ["sizes"]))
+    nodes.append(helper.make_node("ReduceMin", ["sizes"], ["least"], keepdims=0))
+    nodes.append(helper.make_node("Mul", [_most(nodes, "sizes"), "part"], ["a_part"]))
+    nodes.append(helper.make_node("Sub", ["least", "a_part"], ["evenness"]))
+    nodes.append(helper.make_node("Sqrt", ["evenness"], ["root"]))
+    return "root"
+
+
 # They ask for more memory than they may.
 GREEDY: dict[str, Burden] = {
     "outer_product_40_GB": _outer_product(100_000),
