@@ -144,9 +144,8 @@ def read_manifests(
     """
     manifests = [SweepManifest.read(folder) for folder in folders]
     whole = join_manifests(manifests)
-    for folder, manifest in zip(folders, manifests, strict=True):
+    for folder, manifest in [*zip(folders, manifests, strict=True), (folders[0], whole)]:
         if labelled:
             check_labelled(folder, manifest)
         check_split(folder, manifest)
-    check_split(folders[0], whole)
     return manifests, whole
