@@ -69,7 +69,8 @@ def _parse(nodes: settings.SettingNode, folder: Path | None = None) -> SweepReci
     if slip and not Path(source).exists():
         why = f"no such folder {objects.source!r}; did you mean {slip[0]}?"
         raise settings.refusal(nodes, ["objects", "from"], why)
-    return replace(recipe, objects=msgspec.structs.replace(objects, source=source))
+    labels = objects.labels and _make_absolute(objects.labels, folder)
+    return replace(recipe, objects=msgspec.structs.replace(objects, source=source, labels=labels))
 
 
 def _add_usual_values(nodes: settings.SettingNode, folder: Path | None) -> None:

@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain, pairwise
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from tactile_rt.core.errors import ConfigError
@@ -113,7 +112,7 @@ class MeshObjects:
         # Imported here, since it cuts meshes and is slow to import.
         from tactile_rt.sim_backend.objects.object_sets import open_objects
 
-        return open_objects(Path(self.choice.source), self.choice.mesh)
+        return open_objects(self.choice.source, self.choice.mesh, self.choice.labels)
 
     @cached_property
     def _names(self) -> dict[str, str]:

@@ -134,6 +134,8 @@ class ObjectChoice(msgspec.Struct, frozen=True):
             fraction.
         per_withheld: The number of objects in each category of `withheld` and `outliers`; 0 for 12,
             or for all that the folder has.
+        labels: The JSON file with the labels of ShapeNet objects, ``{"02958343/1a0b": 17}``, that
+            replace their synsets, if any. Objects without a label are left out.
         without_source: The source, in a folder's `objects.csv`, whose objects are left out, if any.
         only_source: The only source to use objects of, if any. All are for the test split, without
             those of the same shape as an object from another source.
@@ -150,6 +152,7 @@ class ObjectChoice(msgspec.Struct, frozen=True):
     validation: float = None  # type: ignore[assignment]
     test: float = None  # type: ignore[assignment]
     per_withheld: int = 0
+    labels: str = ""
     without_source: str = ""
     only_source: str = ""
     surface_error_mm: float = STANDARD.surface_error_mm
@@ -186,6 +189,8 @@ class ObjectChoice(msgspec.Struct, frozen=True):
                 if both := sorted(set(getattr(self, key)) & set(getattr(self, other))):
                     raise ConfigError(f"{key}: {both[0]!r} is also one of the {other}")
         whole = self.generated
+        if whole and self.labels:
+            raise ConfigError(f"labels are for a folder of ShapeNet objects, not {self.source}")
         if self.per_withheld < 0:
             raise ConfigError(f"per_withheld must be 0 or more, not {self.per_withheld}")
         for name in ("per_category", "validation", "test"):

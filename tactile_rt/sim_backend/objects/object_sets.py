@@ -3,7 +3,8 @@
 The files that exist decide between two layouts:
 
     ShapeNetCore    <synset>/<object id>/models/model_normalized.obj, and taxonomy.json beside them,
-                    which names the categories (else their synsets do)
+                    which names the categories (else their synsets do); or a JSON file of labels
+                    does, as the published ones divide 53 synsets into 117
     plain           <category>/<object>.obj (or another of `mesh_files.MESH_SUFFIXES`), and
                     optionally objects.csv, with sources and the objects that are alike
 
@@ -23,7 +24,7 @@ from pathlib import Path
 import msgspec
 
 from tactile_rt.core.errors import ConfigError
-from tactile_rt.core.settings import check_columns, convert, read_csv
+from tactile_rt.core.settings import check_columns, convert, read_csv, read_text
 from tactile_rt.sim_backend.objects.mesh_detail import STANDARD, MeshDetail
 from tactile_rt.sim_backend.objects.mesh_files import MESH_SUFFIXES, UNREAD_SUFFIXES
 from tactile_rt.sim_backend.objects.meshes import load_mesh
@@ -116,21 +117,30 @@ class ObjectSet:
         return found
 
 
-def open_objects(where: str | Path, detail: MeshDetail = STANDARD) -> ObjectSet:
+def open_objects(
+    where: str | Path, detail: MeshDetail = STANDARD, labels: str | Path = ""
+) -> ObjectSet:
     """Find the mesh objects in a folder of either layout.
 
     Args:
         detail: how meshes become pieces; in a ShapeNet folder y is up, unless `detail.up` is set.
+        labels: JSON file with the label of each ShapeNet object to use, a name or number:
+            ``{"02958343/1a0b": 17}``; its category is then ``label-017``. "" for none.
     """
     folder = Path(where)
     if not folder.is_dir():
         raise ConfigError(f"{folder}: no such folder of objects")
     shapenet = sorted(folder.glob(f"*/*/{SHAPENET_FILE.as_posix()}"))
     if shapenet:
-        titles = _read_taxonomy(folder)
-        named = [(titles.get(p.parents[2].name, p.parents[2].name), p.parents[1].name, p)
-                 for p in shapenet]  # fmt: skip
+        named = [(p.parents[2].name, p.parents[1].name, p) for p in shapenet]
+        if labels:
+            named = _relabel(named, Path(labels))
+        else:
+            titles = _read_taxonomy(folder)
+            named = [(titles.get(synset, synset), name, p) for synset, name, p in named]
         return ObjectSet(folder, _name_files(folder, named), replace(detail, up=detail.up or "y"))
+    if labels:
+        raise ConfigError(f"{folder} is not ShapeNetCore; `labels` are for its objects alone")
     files = sorted(folder.glob("[!.]*/[!.]*"))
     plain = [p for p in files if p.suffix.lower() in MESH_SUFFIXES]
     read = {p.with_suffix("") for p in plain}
@@ -143,6 +153,23 @@ def open_objects(where: str | Path, detail: MeshDetail = STANDARD) -> ObjectSet:
         )
     named = [(p.parent.name, p.stem, p) for p in plain]
     return ObjectSet(folder, _name_files(folder, named), detail, dict(read_table(folder)))
+
+
+def _relabel(named: list[tuple[str, str, Path]], path: Path) -> list[tuple[str, str, Path]]:
+    """Replace the synsets of objects by their labels in a JSON file; omit objects without one."""
+    try:
+        labels = msgspec.json.decode(read_text(path), type=dict[str, int | str])
+    except msgspec.MsgspecError as error:
+        raise ConfigError(f"{path} is not {{SYNSET/OBJECT: LABEL}} in JSON: {error}") from None
+    found = []
+    for synset, name, file in named:
+        label = labels.get(f"{synset}/{name}")
+        if label is not None:
+            category = label if isinstance(label, str) else f"label-{label:03d}"
+            found.append((category, name, file))
+    if not found:
+        raise ConfigError(f"{path} has no label of any object, such as {named[0][0]}/{named[0][1]}")
+    return found
 
 
 def _name_files(folder: Path, found: list[tuple[str, str, Path]]) -> dict[str, Path]:

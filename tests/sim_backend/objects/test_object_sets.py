@@ -12,6 +12,7 @@ import trimesh
 from tactile_rt.sets.manifest import SweepManifest
 from tactile_rt.sim_backend.datasets.dataset import make_sweeps
 from tactile_rt.sim_backend.datasets.recipe_files import read_recipe
+from tactile_rt.sim_backend.datasets.recipe_objects import choose_objects
 from tactile_rt.sim_backend.objects import meshes
 from tactile_rt.sim_backend.objects.mesh_detail import MeshDetail
 from tactile_rt.sim_backend.objects.meshes import load_mesh
@@ -140,6 +141,22 @@ def test_a_shapenet_folder_without_its_taxonomy(shapenet: Path) -> None:
     assert open_objects(shapenet).names[0] == "02876657/c3"
     (shapenet / "taxonomy.json").write_text('{"not": "a list"}')
     assert "taxonomy.json is not ShapeNet's taxonomy" in refusal(open_objects, shapenet)
+
+
+def test_labels_replace_the_synsets_of_a_shapenet_folder(shapenet: Path, tmp_path: Path) -> None:
+    file = tmp_path / "categories.json"
+    file.write_text('{"03001627/b2": 17, "02876657/c3": "flask", "02958343/other": 3}')
+    assert open_objects(shapenet, labels=file).names == ("flask/c3", "label-017/b2")
+    sets = [f"objects.from={shapenet}", f"objects.labels={file}"]
+    choice = read_recipe("paper-lowvar-highfi", sets=sets).objects
+    assert choose_objects(choice).categories == ("flask", "label-017")
+    file.write_text('{"02958343/other": 3}')
+    assert "has no label of any object, such as 02876657/c3" in refusal(
+        open_objects, shapenet, labels=file
+    )
+    file.write_text("[3]")
+    assert "is not {SYNSET/OBJECT: LABEL}" in refusal(open_objects, shapenet, labels=file)
+    assert "not ShapeNetCore" in refusal(open_objects, shapenet / "03001627", labels=file)
 
 
 def test_a_folder_of_folders(tmp_path: Path) -> None:
