@@ -7,7 +7,7 @@ import threading
 import time
 from collections import Counter
 from collections.abc import Generator
-from contextlib import closing
+from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,6 +17,7 @@ from tactile_rt.cli.app import app, check_folder, check_text, leaving, open_url
 from tactile_rt.cli.options import Json, Seconds, Url, argument, option
 from tactile_rt.cli.tables import told_as_json
 from tactile_rt.core.errors import ConfigError, SourceError, SpecMismatch
+from tactile_rt.core.settings import split_url
 
 if TYPE_CHECKING:
     from tactile_rt.core.stream import Chunk, Source
@@ -186,7 +187,7 @@ class Orders:
 def _teach(teacher: "Teacher", source: "Source", url: str, orders: Orders) -> None:
     """Collect touches until the lesson is complete, the stream ends, or the user stops."""
     from tactile_rt.core.stream import EndOfStream
-    from tactile_rt.recording import Recording, StreamWriter
+    from tactile_rt.recording import StreamWriter
     from tactile_rt.teaching.lesson import BEFORE_NS
 
     lesson = teacher.lesson
@@ -199,16 +200,19 @@ def _teach(teacher: "Teacher", source: "Source", url: str, orders: Orders) -> No
     if not source.live and teacher.wanted:
         order = f"{teacher.each} touches of each, in this order: {', '.join(teacher.wanted)}"
         _say(f"a recording is taken to hold {order}; --touches sets another number")
-    before = lesson.folder.glob("session-*.mcap") if not source.live else ()
-    if any(Recording(one).description.source == url for one in before):
-        raise ConfigError(
-            f"{lesson.folder} holds touches of {url} already: teach it in another folder, or "
-            "correct what labels.csv says of them"
+    held = not source.live and _is_held(lesson.folder, url)
+    if held:
+        _say(
+            f"{lesson.folder} holds the touches of this recording, so it only learns again, as its "
+            "labels.csv says; to take them anew, teach in another folder"
         )
     earlier = len(lesson.touches)
     path = lesson.next_recording()
     orders.listen()
-    with StreamWriter(path, source, url=url) as writer, closing(_receive(source, orders)) as coming:
+    with (
+        nullcontext() if held else StreamWriter(path, source, url=url) as writer,
+        closing(_receive(source, orders)) as coming,
+    ):
         if sys.stdin is not None and sys.stdin.isatty() and not teacher.done:
             typer.echo(HELP)
         typer.echo(teacher.prompt())
@@ -224,6 +228,8 @@ def _teach(teacher: "Teacher", source: "Source", url: str, orders: Orders) -> No
             except EndOfStream:
                 break
             _say(teacher.obey(order) if order else "")
+            if writer is None:
+                continue
             if chunk is None:
                 if time.monotonic() - sampled_at > SILENT_S and not silent:
                     silent = True
@@ -246,12 +252,27 @@ def _teach(teacher: "Teacher", source: "Source", url: str, orders: Orders) -> No
             if listener.hasty > hasty:
                 _say(teacher.note(HASTY))
             teacher.watch(listener.seconds(int(chunk.t_ns[-1])))
-    if not source.live:
+    if not source.live and not held:
         taken = Counter(touch.label for touch in lesson.touches[earlier:])
         _say("found in it: " + (", ".join(f"{n} {label}" for label, n in taken.items()) or "none"))
         each, more = divmod(taken.total(), len(teacher.wanted) or 1)
         if teacher.wanted and not earlier and each not in (0, teacher.each) and not more:
-            _say(f"{taken.total()} touches: if each was touched {each} times, --touches {each}")
+            _say(
+                f"{taken.total()} touches: if each was touched {each} times, teach another folder "
+                f"with --touches {each}"
+            )
+
+
+def _is_held(folder: Path, url: str) -> bool:
+    """Return whether a lesson's folder has the touches of the recording that a URL names."""
+    from tactile_rt.recording import Recording
+
+    def find(url: str) -> tuple[str, Path]:
+        scheme, target, _ = split_url(url)
+        return scheme, Path(target).resolve()
+
+    recorded = (Recording(one).description.source for one in folder.glob("session-*.mcap"))
+    return find(url) in map(find, recorded)
 
 
 def _receive(source: "Source", orders: Orders) -> "Generator[tuple[Chunk | None, str], None, None]":

@@ -109,7 +109,7 @@ def test_names_of_an_asc_log_are_those_of_the_dbc_file(call, bus):
 def test_a_rate_that_nobody_said_is_not_said(call, cwd):
     (cwd / "a.txt").write_text("".join(f"{k} {k / 4}\n" for k in range(90)))
     code, said, told = call("import", "a.txt", "--as", "codec=ascii_line&columns=S.fx,S.fy")
-    assert code == 0 and "their rate is not known: 100 Hz" in told and " said" not in said
+    assert code == 0 and "the rate is not known: 100 Hz" in told and " said" not in said
     (cwd / "b.txt").write_text("".join(f"{10 * (k % 80)} {k / 4}\n" for k in range(120)))
     code, said, told = call("import", "b.txt", "--as", "codec=ascii_line&columns=time:ms,S.fx")
     assert code == 0 and "the device's clock goes back 1 times" in told and " said" not in said

@@ -92,7 +92,9 @@ def import_wire(
             made.said_hz = None
             return made
     elif not claimed:
-        account.notes.append(f"their rate is not known: {account.rate_hz:g} Hz, or say --rate")
+        account.notes.append(
+            f"the rate is not known: {account.rate_hz:g} Hz is assumed; --rate sets it"
+        )
     account.said_hz = account.rate_hz if claimed else None
     if account.samples >= FEW and not UNUSUAL > came_hz / account.rate_hz > 1 / UNUSUAL:
         account.notes.append(
