@@ -272,7 +272,7 @@ def _show_scores(results: Any) -> None:
             "raw sensor input", f"{_format(raw.score)} ± {_format(raw.sem)}", _format(raw.p, 4)
         )
     table.add_row("animal to animal", f"{_format(a2a.mean)} ± {_format(a2a.sem)}")
-    table.add_row("its highest", _format(a2a.highest))
+    table.add_row("best pair of animals", _format(a2a.highest))
     print_table(table)
 
 

@@ -118,9 +118,15 @@ def _read_text(path: Path) -> str:
 
 
 @app.command(epilog="tactile-rt recipes")
-def recipes(json: Json = None) -> None:
+def recipes(
+    plot: Annotated[Path | None, option("Picture of every augmentation, .png.")] = None,
+    json: Json = None,
+) -> None:
     """List the shipped training recipes and the values tried."""
     from tactile_rt.models.training.recipes import load_recipe, shipped_recipes
+
+    if plot:
+        _draw_augmentations(plot)
 
     found: list[dict[str, Any]] = []
     for name in shipped_recipes():
@@ -128,6 +134,21 @@ def recipes(json: Json = None) -> None:
         tried = (f"{key} {', '.join(map(str, v))}" for key, v in recipe.search.items())
         found.append({"recipe": name, "about": recipe.about, "tried": "; ".join(tried)})
     show_table(found, {"recipe": "recipe", "about": "what", "tried": "tried"}, json)
+
+
+def _draw_augmentations(path: Path) -> None:
+    """Draw a whisked object of the shipped stimuli, as each augmentation changes it."""
+    from tactile_rt.alignment.stimuli_input import read_stimuli
+    from tactile_rt.classifier.model_file import SHIPPED, read_model
+
+    check_output(path)
+    if path.suffix.lower() != ".png":
+        raise ConfigError(f"{path}: the picture must be a .png")
+    with needing("train"):
+        from tactile_rt.models.evaluation.pictures import draw_augmentations
+        from tactile_rt.models.training.config import AUGMENTATIONS
+    array, touch = read_model(SHIPPED)[0].array, read_stimuli().samples[0]
+    draw_augmentations(array, touch, AUGMENTATIONS, path)
 
 
 @app.command(epilog="tactile-rt probe run/best.pt probed --data sweeps")

@@ -9,7 +9,9 @@ from collections import defaultdict
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pytest
+from matplotlib.image import imread
 
 from tactile_rt import cli
 from tactile_rt.classifier.model_file import shipped_model
@@ -174,3 +176,12 @@ def test_no_word_of_a_help_is_cut(columns):
     assert "…" not in done.stdout
     if columns != "40":  # where a column of options leaves too little for some words
         assert [x for x in done.stdout.splitlines() if len(x) > int(columns)] == []
+
+
+def test_recipes_draw_every_augmentation(call, tmp_path):
+    code, _, err = call("recipes", "--plot", tmp_path / "augmentations.png")
+    assert code == 0, err
+    drawn = imread(tmp_path / "augmentations.png")[..., :3]
+    rows = np.array_split(drawn[:, 200:].mean(axis=2), 7)  # without the names
+    assert len({round(float(row.mean()), 6) for row in rows}) == 7
+    assert call("recipes", "--plot", tmp_path / "a.txt")[0] == 2

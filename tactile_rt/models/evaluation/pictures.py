@@ -3,10 +3,16 @@
 from pathlib import Path
 
 import numpy as np
+import torch
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from tactile_rt.core.stream import ArraySpec
+from tactile_rt.models import augmentation
+from tactile_rt.models.ead import InputStage
 from tactile_rt.models.evaluation import measures
+
+EVERY = 2  # steps from one drawn frame to the next
 
 
 def draw_confusion(table: NDArray[np.int64], labels: tuple[str, ...], path: Path) -> None:
@@ -74,4 +80,44 @@ def draw_over_time(
     axes.set_xlim(0, None)
     axes.grid(alpha=0.3)
     axes.legend(loc="lower right")
+    figure.savefig(path, dpi=110)
+
+
+def draw_augmentations(
+    spec: ArraySpec, samples: NDArray[np.float32], names: tuple[str, ...], path: Path
+) -> None:
+    """Draw a window's frames as each augmentation changes them, and with masked steps.
+
+    A row is an augmentation, a column a step, a cell a place of the grid: the root mean square of
+    its channels, each a share of the channel's largest load. This is the paper's Figure 2b.
+
+    Args:
+        samples: (step, sub-step, element, channel), SI.
+        names: the augmentations; "none" leaves the frames as they are.
+    """
+    clip = np.abs(samples).max(axis=(0, 1, 2))
+    stage = InputStage(spec.grid, spec.grid_shape, clip.tolist(), clip.tolist(), "paper")
+    window = torch.from_numpy(samples)[None]
+    rest = torch.zeros_like(window[:, 0, 0])
+    names = (*names, "masking")
+    figure = Figure(figsize=(11, 0.85 * len(names)), layout="constrained")
+    grid = figure.subplots(len(names), -(-len(samples) // EVERY))
+    for name, row in zip(names, grid, strict=True):
+        draw = torch.Generator().manual_seed(0)
+        share = 0.75 if name == "masking" else 0.0  # of the steps, as published
+        built = augmentation.build("none" if share else name, spec, share)
+        frames = built.mask(
+            built.frames(stage(*built.loads((window, rest, rest), draw)), draw), draw
+        )
+        cells = frames[0].square().mean(dim=1).sqrt().numpy()
+        for at, axes in zip(range(0, len(samples), EVERY), row, strict=True):
+            axes.imshow(np.sqrt(cells[at]), cmap="inferno", vmin=0, vmax=1)
+            axes.set_xticks([])
+            axes.set_yticks([])
+            if name == names[0]:
+                axes.set_title(f"step {at + 1}", fontsize=9)
+        row[0].set_ylabel(
+            "as it is" if name == "none" else name, rotation=0, ha="right", va="center"
+        )
+    figure.suptitle("One touch: the load at each element, as augmentations change it", fontsize=11)
     figure.savefig(path, dpi=110)

@@ -156,7 +156,7 @@ def open_objects(
 
 
 def _relabel(named: list[tuple[str, str, Path]], path: Path) -> list[tuple[str, str, Path]]:
-    """Replace the synsets of objects by their labels in a JSON file; omit objects without one."""
+    """Replace the synsets of objects by labels in a JSON file; omit unlabelled objects."""
     try:
         labels = msgspec.json.decode(read_text(path), type=dict[str, int | str])
     except msgspec.MsgspecError as error:
