@@ -353,7 +353,7 @@ class FakeFolder:
 @pytest.fixture
 def folder(monkeypatch: pytest.MonkeyPatch):
     def use(sizes: dict[str, int]) -> None:
-        module = SimpleNamespace(open_objects=lambda path, mesh: FakeFolder(sizes))
+        module = SimpleNamespace(open_objects=lambda path, mesh, labels: FakeFolder(sizes))
         monkeypatch.setitem(sys.modules, "tactile_rt.sim_backend.objects.object_sets", module)
 
     return use
