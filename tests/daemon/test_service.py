@@ -180,7 +180,7 @@ REFUSED = [
         '[[model]]\nsource = "b"\nfile = "/var/lib/tactile-rt/m.onnx"\n',
         "mkdir /var/lib/tactile-rt; "
         f"cp {shlex.quote(str(shipped_model()))} /var/lib/tactile-rt/m.onnx",
-        "the service would own /var/lib/tactile-rt/m.onnx, which it reads",
+        "the service would own /var/lib/tactile-rt/m.onnx, which it only reads",
     ),
     (
         "", f"{OTHERS}mv /srv/bobs /var/lib/tactile-rt",

@@ -89,7 +89,7 @@ def test_recordings_that_are_not_asked_for_are_kept_apart(night, tmp_path):
         (HEADER + "night.mcap,-1,2,mug,\n", "labels.csv:2: start_s: must be 0 or more, not -1"),
         (HEADER + "\nnight.mcap,3,2,mug,\n", "labels.csv:3: end_s: must be after start_s, 3 s"),
         (HEADER + "night.mcap,1,2,,\n", "labels.csv:2: label: is empty; name what"),
-        (HEADER + "night.mcap,1,2,unknown,\n", "labels.csv:2: label: 'unknown' has a meaning"),
+        (HEADER + "night.mcap,1,2,unknown,\n", "labels.csv:2: label: 'unknown' is reserved"),
         (HEADER + "night.mcap,1,2,mug,../x\n", "labels.csv:2: object: '../x' cannot be part"),
         (HEADER + f"night.mcap,1,2,mug,{'漢' * 41}\n", "object: .* too long: 123 bytes, 120 at"),
         (HEADER + "nigth.mcap,1,2,mug,\n", "2: recording: no file 'nigth.mcap' .* mean night.mcap"),
