@@ -105,9 +105,12 @@ class Sequencer:
         if content in self._seen and (gap < 0 or tick != self._tick):
             self._stats.duplicates += 1
             return None
-        self._standing = self._standing + 1 if count == self._count and gap < 0 else 0
+        stood, self._standing = self._standing, 0
+        if gap < 0 and count == self._count:
+            self._standing = stood + 1
+        elif stood < STANDING:  # a reset to the same count, not a counter that stands
+            self.resets += stood + (gap < 0)
         if gap < 0:
-            self.resets += not self.useless
             self._seen.clear()
             self._steps_in_tick = gap = 0
         elif self._count is not None:

@@ -30,6 +30,7 @@ def test_a_counter_that_stands_is_none_until_it_goes_on(clock):
         sequencer.number(samples([count], content=[float(k)], ticks=[1000 * k]))
         found.append(sequencer.useless)
     assert not any(found[:24]) and all(found[25:40]) and not any(found[40:])
+    assert sequencer.resets == 0, "what stands was not begun anew"
 
 
 def test_noise_between_samples_is_no_lost_sample():
