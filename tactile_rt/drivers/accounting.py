@@ -46,6 +46,7 @@ class Sequencer:
 
     Attributes:
         numbered: Number of samples numbered so far, including those lost in gaps.
+        known_resets: Number of resets of the counter after which it went on.
     """
 
     def __init__(
@@ -55,7 +56,8 @@ class Sequencer:
         period_ticks: float | None = None,
         tick_bits: int = 32,
     ) -> None:
-        self.resets = self._standing = 0  # the latter: successive samples of an unchanged count
+        self.known_resets = self._unsure = 0
+        self._standing = 0  # successive samples of an unchanged count
         self._wrap = None if bits is None else 1 << bits
         self._stats = stats
         self._period_ticks, self._tick_wrap = period_ticks, 1 << tick_bits
@@ -68,6 +70,11 @@ class Sequencer:
         # Without a clock, a sample before the counter's last wrap can look like this one.
         turn = REMEMBERED if bits is None or period_ticks is not None else 1 << bits
         self._remembered = min(REMEMBERED, turn)
+
+    @property
+    def resets(self) -> int:
+        """Number of resets of the counter, with those after which it may turn out to stand."""
+        return self.known_resets + self._unsure
 
     @property
     def useless(self) -> bool:
@@ -105,11 +112,14 @@ class Sequencer:
         if content in self._seen and (gap < 0 or tick != self._tick):
             self._stats.duplicates += 1
             return None
-        stood, self._standing = self._standing, 0
-        if gap < 0 and count == self._count:
-            self._standing = stood + 1
-        elif stood < STANDING:  # a reset to the same count, not a counter that stands
-            self.resets += stood + (gap < 0)
+        stood = self.useless
+        self._standing = self._standing + 1 if count == self._count and gap < 0 else 0
+        if self.useless or (stood and gap < 0):
+            self._unsure = 0
+        elif gap < 0:
+            self._unsure += 1
+        else:
+            self.known_resets, self._unsure = self.resets, 0
         if gap < 0:
             self._seen.clear()
             self._steps_in_tick = gap = 0

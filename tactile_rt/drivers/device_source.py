@@ -179,7 +179,7 @@ class DeviceSource(Source):
             state, since, reason, self._connections, newest,
             clock.drift_ppm if clock and self.codec.tick_ns else 0.0,
             clock.steps if clock else 0,
-            stamper.sequencer.resets,
+            stamper.sequencer.known_resets,
             tuple(meaning for bit, meaning in bits if status >> bit & 1),
             self._can_errors + (link.can_errors if link else 0),
             self.codec.stats,
@@ -304,7 +304,7 @@ class DeviceSource(Source):
     def _ask_again(self, now_ns: int, silent_ns: int) -> None:
         """Request a description again if the device is silent or its counter was reset."""
         assert self._stamper is not None
-        resets = self._stamper.sequencer.resets
+        resets = self._stamper.sequencer.known_resets
         well = silent_ns < max(ASK_NS, self._stale_ns) and resets == self._resets
         if well or now_ns - self._asked_ns < ASK_NS or self._link is None:
             return
