@@ -73,7 +73,7 @@ class Sequencer:
 
     @property
     def resets(self) -> int:
-        """Number of resets of the counter, with those after which it may turn out to stand."""
+        """Number of resets of the counter, including those not yet known for sure."""
         return self.known_resets + self._unsure
 
     @property
