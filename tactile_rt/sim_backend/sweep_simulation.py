@@ -24,6 +24,7 @@ from tactile_rt.sim_backend.sweep import (
     way_to_contact,
     within_reach,
 )
+from tactile_rt.sim_backend.transducer import sensor_of
 from tactile_rt.sim_backend.world import PROFILES, SAMPLE_MS, Profile, engine_of
 
 TOO_MUCH = 1.1  # a damping ratio more than this many times its target is reported
@@ -190,6 +191,11 @@ class SweepSimulation:
         """The engine, created at the first sample, since a rejected draw needs none."""
         profile = self._profile
         if engine_of(profile) != "rods":
+            if (sensor := sensor_of(self._animals)) and sensor.feels_turns:
+                raise ConfigError(
+                    "the engine mujoco does not report how bases rotate, which this sensor reads: "
+                    "use profile realtime, dataset or accurate, with numba installed"
+                )
             return MujocoWorld(self.model, self._whiskers, profile, self._start)
         from tactile_rt.sim_backend.rods.world import Piece, RodWorld
 
@@ -249,7 +255,7 @@ class SweepSimulation:
             found = self._world.advance(way, every, self._compute_acceleration(first, samples))
             loads[:, self._simulated] = found[0] - self._tare
             contacts[:, self._simulated] = found[1]
-            if len(self._world.turns):  # MuJoCo's bases are rigid
+            if len(self._world.turns):  # none from MuJoCo
                 self._base_turns[:, self._simulated] = self._world.turns
             self._note_wedged(getattr(self._world, "overlap", np.zeros((0, 0))))
         return loads, contacts

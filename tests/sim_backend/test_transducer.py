@@ -169,3 +169,9 @@ def test_files_that_cannot_be(change: tuple[str, str], why: str, tmp_path: Path)
         open_source(f"sim:{file}")
     assert why in str(error.value)
     assert "\n" not in str(error.value)
+
+
+def test_mujoco_refuses_a_sensor_that_reads_how_bases_rotate() -> None:
+    with pytest.raises(ConfigError, match="the engine mujoco does not report how bases rotate"):
+        with open_source(f"sim:{MAGNETS}?profile=mujoco&objects=mug-1&sweeps=1") as source:
+            list(source)
