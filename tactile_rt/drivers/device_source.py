@@ -237,6 +237,8 @@ class DeviceSource(Source):
         link = self._link
         if self.codec.polls:
             left = self._poll(link, now, left)
+            if self._link is None:  # lost as it was polled
+                return None
         try:
             found = link.receive(left)
         except SourceError as error:
