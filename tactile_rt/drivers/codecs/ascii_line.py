@@ -77,7 +77,8 @@ class AsciiLine(SerialCodec):
         line_end: Line end to assume before the first line of a file.
         claims_rate: Whether the user has given the board's rate.
         unfinished: Number of bytes received so far of an incomplete sample.
-        passed: Number of lines of words between samples.
+        passed: Number of lines after the first sample that are mostly words, and of samples whose
+            beginning did not come.
     """
 
     Options = AsciiLineOptions
@@ -296,9 +297,18 @@ class AsciiLine(SerialCodec):
                 names = ", ".join(repr(c.label) for c in self._columns)
                 self.complaint = f"line {quote_line(text)} has none of {names}"
             return
+        if self._names.ambiguous:
+            either = f"{self._names.ambiguous} is a decimal comma or two numbers"
+            self.complaint = f"{either}: line {quote_line(text)}"
+            self._open = {}
+            self._count_damaged()
+            return
         if 0 in found or not found.keys().isdisjoint(self._open):
             if self._open and self._has_beginning:
                 self._end_sample()
+            elif self._open:
+                self.stats.skipped += self._open_bytes
+                self.passed += 1
             self._open, self._open_bytes, self._has_beginning = {}, 0, True
         self._open |= found
         self._open_bytes += len(text) + 1

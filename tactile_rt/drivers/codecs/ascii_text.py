@@ -39,6 +39,7 @@ _BRACKETS: Final = str.maketrans(dict.fromkeys("()[]{}<>\"'|", " "))
 _SEPARATORS: Final = re.compile(r"[\s,;]+")
 _ARROW: Final = re.compile(r"[-=]>")
 _BETWEEN: Final = r"(?:\s*->\s*|[\"'\s:=\[(|>~]{1,8})"  # between a name and its number
+_MORE_DIGITS: Final = re.compile(r",\d[\d.,]*")  # directly behind a number
 _SIGNS: Final = frozenset("=:/~#*")
 
 
@@ -87,10 +88,19 @@ class Names:
     Args:
         names: column of each number, by its name; ``a.b`` for a number in an object of JSON,
             ``a.2`` for the third number after a name.
+
+    Attributes:
+        ambiguous: Text of the last line such as ``4,25``: a decimal comma, or two numbers? Else "".
     """
+
+    ambiguous = ""
 
     def __init__(self, names: Mapping[str, int]) -> None:
         self._names = names
+        bases = {base for base, index in map(_split_index, names) if index}
+        self._single = {
+            place for name, place in names.items() if _split_index(name)[0] not in bases
+        }
         self._patterns = {place: _compile_name(name) for name, place in names.items()}
         known = "|".join(map(re.escape, names))
         then = rf"(?=[{{\"']*({known})[\"']?\s*[:=])"
@@ -98,6 +108,7 @@ class Names:
 
     def find(self, line: str) -> dict[int, float]:
         """Return the numbers of a line by column; NaN if a name precedes no number."""
+        self.ambiguous = ""
         if line.lstrip()[:1] == "{":
             try:
                 decoded = msgspec.json.decode(line)
@@ -109,12 +120,14 @@ class Names:
                     for name, place in self._names.items()
                     if (value := _get_value(decoded, name.split("."))) is not ABSENT
                 }
-        text = in_seconds(line)
-        return {
-            place: _to_number(found[1])
-            for place, pattern in self._patterns.items()
-            if (found := pattern.search(text))
-        }
+        text, numbers = in_seconds(line), {}
+        for place, pattern in self._patterns.items():
+            if found := pattern.search(text):
+                numbers[place] = _to_number(found[1])
+                more = _MORE_DIGITS.match(text, found.end())
+                if more and place in self._single and text[found.start(1) - 1] not in "[({":
+                    self.ambiguous = found[1] + more[0]
+        return numbers
 
     def cut_glued(self, line: str) -> str:
         """Return the rest of a line after a sample that breaks off; else empty."""
@@ -151,14 +164,21 @@ def _to_number(value: Any) -> float:
     return NAN if found is None else found
 
 
+def _split_index(name: str) -> tuple[str, str]:
+    """Split ``a.2`` into ``a`` and ``2``; the index is empty if there is none."""
+    base, _, index = name.rpartition(".")
+    return (base, index) if base and index.isdecimal() else (name, "")
+
+
 def _compile_name(name: str) -> re.Pattern[str]:
-    base, _, place = name.rpartition(".")
-    if not (base and place.isdecimal()):
-        base, place = name, "0"
+    base, index = _split_index(name)
     before = r"(?<![\w.])" if base[:1].isalnum() or base[:1] == "_" else ""
     value = r"[^\s,;:=\[\](){}|\"']+"
     return re.compile(
-        before + re.escape(base) + _BETWEEN + rf"(?:{value}\s*[,;\s]\s*){{{int(place)}}}({value})"
+        before
+        + re.escape(base)
+        + _BETWEEN
+        + rf"(?:{value}\s*[,;\s]\s*){{{int(index or 0)}}}({value})"
     )
 
 

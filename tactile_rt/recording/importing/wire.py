@@ -69,7 +69,9 @@ def import_wire(
         if log.wire == "serial" and decoded.unfinished:
             account.notes.append(f"it ends with {decoded.unfinished} bytes of no whole sample")
         if passed := getattr(codec, "passed", 0):
-            account.notes.append(f"{passed} lines of words between samples are passed over")
+            account.notes.append(
+                f"lines skipped, of text or of a sample whose beginning is not there: {passed}"
+            )
         made.note(SUMMARY, {"samples": str(account.samples), "packets": str(packets)})
         made.finish()
         _fill_account(log, decoded, account)
@@ -226,7 +228,7 @@ class _DecodedLog:
         before = stats.corrupt
         samples = self._codec.feed(packet, t_ns or 0)
         for _ in range(stats.corrupt - before):
-            self.corrupt.add(self._at + 1)
+            self.corrupt.add(self._at + 1, self._codec.complaint)
         n = len(packet) if isinstance(packet, bytes) else 1
         self._at += n
         self._rest += n

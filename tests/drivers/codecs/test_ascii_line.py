@@ -152,6 +152,18 @@ def test_a_sample_breaks_off_where_a_name_comes_again(line: str, rest: str) -> N
     assert Names({"X": 0, "Y": 1}).cut_glued(line) == rest
 
 
+def test_a_comma_in_a_labelled_number_is_ambiguous_unless_numbers_are_counted() -> None:
+    for names, line, doubt in (
+        ({"F(N)": 0, "T": 1}, "F(N):4,25 T:23.5", "4,25"),
+        ({"F": 0}, "12:00:05,900 -> F: -8,43", "-8,43"),
+        ({"Raw.0": 0, "Raw.1": 1}, "Raw: 1,2", ""),
+        ({"acc": 0}, "acc:[1,2,3]", ""),
+        ({"x": 0, "y": 1}, "x:1,y:2", ""),
+    ):
+        found = Names(names)
+        assert found.find(line) and found.ambiguous == doubt, line
+
+
 def test_a_count_that_is_none_is_damage() -> None:
     codec = ascii_line("count,time:ms,A0.fx")
     lines = b"\n5,10,1\n6.5,20,1\nnan,30,1\n8,inf,1\n1e99,50,1\n-1,60,1\n"

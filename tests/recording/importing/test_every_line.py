@@ -77,11 +77,31 @@ def test_the_lines_that_a_board_printed_add_up(
     fields = {"codec": "ascii_line", "columns": "-,A0.v,A1.v"}
     made = import_wire(read_log(tmp_path / "b.txt"), tmp_path / "o.mcap", fields)
     assert (made.samples, made.intact, made.corrupt) == (N, N, cut)
-    passed = [note for note in made.notes if "lines of words" in note]
-    assert passed == [f"{words} lines of words between samples are passed over"] * bool(words)
+    passed = [note for note in made.notes if "lines skipped, of text" in note]
+    assert len(passed) == bool(words) and all(note.endswith(f": {words}") for note in passed)
     assert any("3 bytes of no whole sample" in n for n in made.notes) == (rest and not stamp)
     again = compare_decoding(tmp_path / "o.mcap")
     assert (again.equal, again.differing) == (N, 0)
+
+
+@pytest.mark.parametrize(
+    ("first", "samples", "corrupt", "told"),
+    [
+        ("(N): 4.25 Temp: 23.75", N, 0, "lines skipped, of text or of a sample whose beginning"),
+        ("Force: 4,25 Temp: 23.75", N, 1, ": 4,25 is a decimal comma or two numbers: line"),
+        ("Force: 1,4.25 Temp: 23.75", N, 1, ": 1,4.25 is a decimal comma or two numbers"),
+        ("Force: 4.25 Temp: (23,75)", N + 1, 0, ""),
+    ],
+)
+def test_a_labelled_line_that_is_cut_or_has_a_comma_is_told(
+    tmp_path, first, samples, corrupt, told
+):
+    lines = [first, *(f"Force: {k}.5 Temp: {k}" for k in range(N))]
+    (tmp_path / "b.txt").write_text("\n".join(lines) + "\n")
+    fields = {"codec": "ascii_line", "columns": "Force=A0.force,Temp=A0.temp", "rate_hz": "100"}
+    made = import_wire(read_log(tmp_path / "b.txt"), tmp_path / "o.mcap", fields)
+    assert (made.samples, made.corrupt) == (samples, corrupt)
+    assert any(told in note for note in made.notes) == bool(told), made.notes
 
 
 TABLES = {  # lines, columns, samples, corrupt, elements that are not valid
