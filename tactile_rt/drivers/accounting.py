@@ -56,7 +56,8 @@ class Sequencer:
         period_ticks: float | None = None,
         tick_bits: int = 32,
     ) -> None:
-        self.known_resets = self._unsure = 0
+        self.known_resets = 0
+        self._unsure = 0  # resets after which the counter has not gone on yet
         self._standing = 0  # successive samples of an unchanged count
         self._wrap = None if bits is None else 1 << bits
         self._stats = stats
@@ -112,18 +113,15 @@ class Sequencer:
         if content in self._seen and (gap < 0 or tick != self._tick):
             self._stats.duplicates += 1
             return None
-        stood = self.useless
-        self._standing = self._standing + 1 if count == self._count and gap < 0 else 0
-        if self.useless or (stood and gap < 0):
-            self._unsure = 0
-        elif gap < 0:
-            self._unsure += 1
-        else:
-            self.known_resets, self._unsure = self.resets, 0
         if gap < 0:
+            stood = self.useless
+            self._standing = self._standing + 1 if count == self._count else 0
+            self._unsure = 0 if stood or self.useless else self._unsure + 1
             self._seen.clear()
             self._steps_in_tick = gap = 0
         elif self._count is not None:
+            self.known_resets += self._unsure
+            self._standing = self._unsure = 0
             self._steps_in_tick = self._steps_in_tick + gap + 1 if tick == self._tick else 0
             self._most_steps_in_tick = max(self._most_steps_in_tick, self._steps_in_tick)
         if gap:
