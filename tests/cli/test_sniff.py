@@ -148,7 +148,7 @@ def test_what_cannot_be_read_is_told_and_not_proposed(call, cwd):
     assert "t=time" not in said and "--rate" in said
     (cwd / "a.csv").write_text("t,Fz\n" + "".join(f"0.{k},ca.{k * k}x\n" for k in range(10, 40)))
     code, said, _ = call("sniff", "a.csv")
-    assert code == 1 and said.endswith("it is read: no measured number in Fz\n")
+    assert code == 1 and said.endswith("no columns were found that fit: no measured number in Fz\n")
     (cwd / "a.csv").write_text("Zeit;Kraft;Weg\n" + "".join(f"{k};2;1.200,5\n" for k in range(9)))
     _, said, _ = call("sniff", "a.csv")
     assert said.endswith("=time:ms,Kraft=Kraft.value:1,Weg=Weg.value:1\n")

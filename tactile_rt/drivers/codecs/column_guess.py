@@ -37,7 +37,7 @@ _UNITS_OF_TIME: Final = {  # by their names, with the word for the column
     for unit in units.split()
 }  # fmt: skip
 _TIME: Final = re.compile(
-    r"(?:%|.*[._ ])?"
+    r"s|ms|us|µs|ns|(?:%|.*[._ ])?"
     r"(?:time|timestamp|stamp|t|secs?|nsecs?|date|datetime|millis|micros|clock|elapsed|x_value"
     r"|(?:uhr)?zeit|datum)"
     rf"(?:s|sec|ms|us|µs|ns|nsec|[\W_]+(?:{'|'.join(_UNITS_OF_TIME)}))?", re.IGNORECASE,

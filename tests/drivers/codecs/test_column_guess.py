@@ -52,6 +52,13 @@ def test_what_a_board_prints_has_columns_that_read_it(form, columns):
     assert codec.stats.intact >= N - 3 and codec.stats.corrupt <= 1
 
 
+@pytest.mark.parametrize("name", ["ms", "us", "s", "ns", "t_ms", "time_ms", "Time (ms)", "millis"])
+def test_a_unit_of_time_names_a_time(name):
+    words, timed = guess_columns([name, "Fx", "Fy"], [[5.0 * k, k % 7, k % 3] for k in range(N)])
+    unit = name.strip(")").replace("millis", "ms").rpartition("_")[2].rpartition("(")[2]
+    assert timed and words[0] == f"time:{unit}"
+
+
 def test_of_several_lines_the_first_that_is_whole_begins_a_sample():
     printed = "".join(f"X: {k} uT\nY: {-k} uT\nZ: {k / 2} uT\n" for k in range(N)).encode()
     for cut, columns in ((0, "X=S.x:1,Y=S.y:1,Z=S.z:1"), (3, "Y=S.y:1,Z=S.z:1,X=S.x:1")):
