@@ -112,7 +112,8 @@ def test_of_several_lines_none_comes_into_another_sample(lost: int) -> None:
     samples = codec.feed(
         b"joined\n" + b"".join(lines[:3] + lines[4:] + [b"\0\0\0\n", b"-1.5\n"]), T0
     )
-    assert (codec.stats.incomplete, codec.stats.corrupt, codec.passed) == (1, 1, 1 + (lost in (1, 2)))
+    told = (codec.stats.incomplete, codec.stats.corrupt, codec.passed)
+    assert told == (1, 1, 1 + (lost in (1, 2)))
     assert samples.valid[:, 0].tolist() == [True, False, True, True]
     assert samples.values[2, 0].tolist() == [3, 3, 3]
 
