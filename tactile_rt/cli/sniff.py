@@ -254,7 +254,7 @@ def _sniff_text(path: Path, data: bytes, form: str, out: _Output) -> bool:
     if proposed is None:
         return False
     if not proposed.columns:
-        out.end_without_result(f"no columns are found with which it is read: {proposed.said}"[:200])
+        out.end_without_result(f"no columns were found that fit: {proposed.said}"[:200])
     out.say(f"{proposed.said}: names and units are for you to say")
     options: list[object] = ["--columns", proposed.columns]
     if not proposed.table:
