@@ -4,10 +4,21 @@ import errno
 import os
 import stat
 import subprocess
+from contextlib import nullcontext
+from pathlib import Path
 
 import pytest
 
-from tactile_rt.core.files import replace_file, replace_folder, write_whole
+from tactile_rt.core.errors import ConfigError
+from tactile_rt.core.files import (
+    POINTER,
+    open_regular,
+    refuse_lfs_pointer,
+    replace_file,
+    replace_folder,
+    sync_folder,
+    write_whole,
+)
 
 
 @pytest.fixture
@@ -107,3 +118,62 @@ def test_what_cannot_be_written_is_named_by_its_own_name(read_only):
     with pytest.raises(OSError) as folder, replace_folder(path):
         pass
     assert {e.value.filename for e in (whole, slow, folder)} == {str(path)}
+
+
+def test_an_error_about_another_file_stays_one_of_that_file(tmp_path):
+    with pytest.raises(FileNotFoundError) as failed:
+        write_whole(tmp_path / "a", lambda out: (tmp_path / "other").read_bytes())
+    assert failed.value.filename == str(tmp_path / "other")
+    with pytest.raises(OSError, match="No space") as failed:
+        write_whole(Path("/dev/full"), lambda out: out.write(b"x"))
+    assert failed.value.filename == "/dev/full"
+
+
+def test_a_file_is_on_the_medium_before_it_has_its_name(tmp_path, monkeypatch):
+    path, seen = tmp_path / "a.pt", []
+    partial = tmp_path / "a.partial"
+    monkeypatch.setattr(os, "fsync", lambda _: seen.append((partial.read_bytes(), path.exists())))
+    with replace_file(path) as file:
+        file.write(b"whole")
+    assert seen == [(b"whole", False)] and path.read_bytes() == b"whole"
+
+
+def test_a_folder_is_synced_by_a_handle_that_is_closed_again(tmp_path, monkeypatch):
+    synced, open_before = [], os.listdir("/proc/self/fd")
+    monkeypatch.setattr(os, "fsync", lambda n: synced.append(os.readlink(f"/proc/self/fd/{n}")))
+    sync_folder(tmp_path)
+    assert synced == [str(tmp_path)] and os.listdir("/proc/self/fd") == open_before
+    (tmp_path / "a").touch()
+    with pytest.raises(NotADirectoryError):
+        sync_folder(tmp_path / "a")
+
+
+@pytest.mark.parametrize("code, fails", [(errno.EINVAL, False), (errno.EIO, True)])
+def test_only_a_file_system_that_cannot_sync_folders_is_excused(tmp_path, monkeypatch, code, fails):
+    def fail(handle):
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(OSError) if fails else nullcontext():
+        sync_folder(tmp_path)
+
+
+def test_a_pipe_is_refused_unopened_and_without_waiting_if_it_has_just_come(tmp_path, monkeypatch):
+    pipe, file = tmp_path / "pipe", tmp_path / "a"
+    os.mkfifo(pipe)
+    file.touch()
+    was, open_before = os.stat(file), os.listdir("/proc/self/fd")
+    for name, fake in (("open", lambda *_: pytest.fail("opened")), ("stat", lambda _: was)):
+        with monkeypatch.context() as patch, pytest.raises(OSError, match="a pipe"):
+            patch.setattr(os, name, fake)
+            open_regular(pipe)
+    assert os.listdir("/proc/self/fd") == open_before
+
+
+def test_a_pointer_to_a_file_is_refused_as_one(tmp_path):
+    pointer = tmp_path / "a.glb"
+    pointer.write_bytes(b"version https://git-lfs.github.com/spec/v1\n")
+    for refuse in (open_regular, refuse_lfs_pointer):
+        with pytest.raises(ConfigError) as refused:
+            refuse(pointer)
+        assert POINTER in str(refused.value)

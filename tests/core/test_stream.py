@@ -96,8 +96,9 @@ def test_differences_can_be_ignored_by_name() -> None:
 
 
 def test_a_pose_may_be_off_by_less_than_anyone_can_measure() -> None:
-    near = tuple((x + 1e-7, y, z) for x, y, z in SPEC.positions)
-    assert SPEC.differences(replace(SPEC, positions=near)) == []
+    for off, same in ((1.5e-6, False), (1e-7, True)):
+        near = tuple((x + off, y, z) for x, y, z in SPEC.positions)
+        assert (SPEC.differences(replace(SPEC, positions=near)) == []) == same
     # and such a harmless difference must not be blamed for a real one further on
     far = with_item(near, 2, (0.001, 0.004, 0.0))
     (said,) = SPEC.differences(replace(SPEC, positions=far))
@@ -247,3 +248,12 @@ def test_quaternions_turn_as_those_of_scipy_do() -> None:
 def test_a_step_is_as_near_to_45_ms_as_samples_are() -> None:
     assert [Timing.of(ns).substeps for ns in (9_000_000, 20_000_000, 90_000_000)] == [5, 2, 1]
     assert Timing() == stream.MOUSE and (stream.MOUSE.substeps, stream.MOUSE.samples) == (5, 110)
+
+
+def test_an_array_of_unknown_geometry_lies_at_its_frame_s_origin():
+    one = ArraySpec.at_origin("a", 100.0, {"fx": "N"})
+    assert (one.elements, one.grid, one.frame) == (("sensor",), ((0, 0),), "sensor")
+    two = ArraySpec.at_origin("a", 100.0, {"fx": "N"}, elements={"L": (0, 1), "R": (2, 3)})
+    assert two.positions == ((0.0, 0.0, 0.0),) * 2 and two.grid == ((0, 1), (2, 3))
+    assert two.orientations == ((1.0, 0.0, 0.0, 0.0),) * 2
+    assert not any(vars(stream.SourceStats()).values()), "nothing is counted at first"

@@ -4,6 +4,7 @@ import contextlib
 import os
 import socket
 import threading
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -31,34 +32,14 @@ class Pty(serial.Serial):
     _update_rts_state = _update_dtr_state
 
 
-class Raw:
+def raw(port, connection):
     """Bytes as they are."""
-
-    def __init__(self, port, connection):
-        pass
-
-    def escape(self, data):
-        yield data
-
-    def filter(self, data):
-        yield data
+    return SimpleNamespace(escape=lambda data: [data], filter=lambda data: [data])
 
 
-class Rfc2217:
+def rfc2217(port, connection):
     """pyserial's own server of RFC 2217."""
-
-    def __init__(self, port, connection):
-        class Peer:
-            def write(self, data):
-                connection.sendall(data)
-
-        self._manager = serial.rfc2217.PortManager(port, Peer())
-
-    def escape(self, data):
-        return self._manager.escape(data)
-
-    def filter(self, data):
-        return self._manager.filter(data)
+    return serial.rfc2217.PortManager(port, SimpleNamespace(write=connection.sendall))
 
 
 @contextlib.contextmanager
@@ -118,7 +99,7 @@ def test_a_backlog_is_one_packet_where_nobody_looked(monkeypatch):
 
 
 @pytest.mark.filterwarnings("ignore:set(Daemon|Name):DeprecationWarning")  # pyserial 3.5's own
-@pytest.mark.parametrize(("scheme", "protocol"), [("socket", Raw), ("rfc2217", Rfc2217)])
+@pytest.mark.parametrize(("scheme", "protocol"), [("socket", raw), ("rfc2217", rfc2217)])
 def test_a_port_on_another_host_is_read_bit_for_bit_and_known_to_be_gone(scheme, protocol):
     values = np.random.default_rng(1).normal(size=(SAMPLES, 4, 6)).astype(np.float32) * 1e-3
     with FakeSerial(values) as fake, served(fake.port, protocol) as (port, hang_up):

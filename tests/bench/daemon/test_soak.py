@@ -10,14 +10,12 @@ from bench.daemon.latencies import latencies
 from bench.daemon.soak import soak_records
 from bench.daemon.soak_rig import soak
 from bench.emulated import KINDS, Played
-from tactile_rt.daemon.config import RecorderConfig
 from tactile_rt.daemon.items import Opened, SourceChunk
-from tactile_rt.daemon.recorder import Recorder
-from tactile_rt.daemon.states import Snapshot
 from tactile_rt.drivers.emulation.faults import Fate
 from tactile_rt.recording import Recording, recover
 from tactile_rt.recording.reader import is_finished
 from tactile_rt.testing import ArraySource, cut_chunks, small_spec
+from tests.helpers.recorder_by_hand import View, begun
 
 MS = 1_000_000
 MUST = ("unbalanced", "unexplained", "miscounted", "queues_unbalanced", "queues_dropped",
@@ -42,30 +40,9 @@ def test_under_faults_every_sample_is_delivered_or_counted():
     assert sum("device:lost" in line for line in result.log.splitlines()) == pulled
 
 
-class Watching:
-    """What a recorder sees of the daemon."""
-
-    def __init__(self):
-        self.told = []
-
-    def snapshot(self):
-        return Snapshot("0", 1, "robot.toml", 1, 1, 0, 0, "running")
-
-    def streams(self):
-        return {}
-
-    def config_text(self):
-        return "version = 1\n"
-
-    def report(self, part, state, reason, level="info"):
-        self.told.append(reason)
-
-
 def test_what_was_added_to_a_file_that_cannot_grow_counts_as_lost(tmp_path):
-    spec, sent = small_spec(30), 200
-    recorder = Recorder("recorder", RecorderConfig(folder=str(tmp_path / "a"), min_free_mb=0))
-    view = Watching()
-    recorder.open(view)
+    spec, sent, view = small_spec(30), 200, View()
+    recorder = begun(view, tmp_path / "a", min_free_mb=0)
     recorder.handle([Opened("a", spec, "synthetic:", ArraySource(spec, []), 1, 1)])
     values = np.random.default_rng(0).normal(size=(sent, *spec.shape))
     chunks = cut_chunks(values, spec.rate_hz, samples=1, start_ns=2)
@@ -88,7 +65,7 @@ def test_what_was_added_to_a_file_that_cannot_grow_counts_as_lost(tmp_path):
         found += [int(number) for chunk in Recording(whole) for number in chunk.seq]
     assert 0 < lost < sent
     assert len(found) == len(set(found)) == sent - lost
-    assert sum("File too large" in reason for reason in view.told) == len(view.told)
+    assert sum("File too large" in reason for _, reason, _ in view.told) == len(view.told)
 
 
 def played(fate, **changed):
