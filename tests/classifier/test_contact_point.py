@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from tactile_rt.classifier.contact_point import ESTIMATES, WhiskerShapes, bent, resting, straight
+from tactile_rt.classifier import contact_point
+from tactile_rt.classifier.contact_point import ESTIMATES, WhiskerShapes
 from tactile_rt.core.errors import ConfigError
 
 ONE = np.zeros(1, dtype=np.int64)
@@ -35,9 +36,9 @@ def test_the_resting_shape_corrects_for_its_curvature() -> None:
     curved = shapes(curvature=a)
     for force in ((-2e-10, 5e-10, 0.0), (0.0, 0.0, 1e-10), (3e-10, 1e-10, -2e-10)):
         loads = push(at, force)
-        assert resting(loads, ONE, curved) == pytest.approx(arc, rel=2e-3)
-        assert bent(loads, ONE, curved) == pytest.approx(arc, rel=5e-3)
-    assert abs(straight(loads, ONE, curved)[0] - arc) > 0.02 * arc
+        assert contact_point.resting(loads, ONE, curved) == pytest.approx(arc, rel=2e-3)
+        assert contact_point.bent(loads, ONE, curved) == pytest.approx(arc, rel=5e-3)
+    assert abs(contact_point.straight(loads, ONE, curved)[0] - arc) > 0.02 * arc
 
 
 def test_the_bent_whisker_finds_the_peg_of_the_elastica() -> None:
@@ -51,13 +52,8 @@ def test_the_bent_whisker_finds_the_peg_of_the_elastica() -> None:
     for case in [c for c in presses() if c.depth > 0.3][::89]:
         whisker, truth = flat(case.whisker, case.bend), case.arc
         loads = np.array([[*case.force, 0, 0, 0, case.moment * 1e-3]]) * 1e-3
-        of = shapes(
-            whisker.length * 1e-3,
-            whisker.curvature * 1e3,
-            whisker.base_radius * 1e-3,
-            whisker.tip_radius * 1e-3,
-            whisker.young_modulus,
-        )
+        radii = whisker.base_radius * 1e-3, whisker.tip_radius * 1e-3
+        of = shapes(whisker.length * 1e-3, whisker.curvature * 1e3, *radii, whisker.young_modulus)
         for name, estimate in ESTIMATES.items():
             error = abs(estimate(loads, ONE, of)[0] * 1e3 - truth) / whisker.length
             worst[name] = max(worst[name], error)

@@ -11,6 +11,7 @@ import time
 import types
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -36,6 +37,7 @@ from tactile_rt.daemon.mailbox import Hub, Mailbox
 from tactile_rt.daemon.messages import encode, message_of, topic_of
 from tactile_rt.daemon.part import Part, reason_of
 from tactile_rt.daemon.states import EDGES_S, LatencyMeter
+from tactile_rt.drivers.codec import CanFrame
 from tactile_rt.testing import ArraySource, cut_chunks, small_spec
 from tests.helpers.processes import start_program
 from tests.helpers.waiting import PATIENCE_S, until
@@ -89,8 +91,21 @@ def test_a_mailbox_takes_what_it_wants_of_the_source_that_it_wants():
     box = Mailbox({SourceChunk}, 10, 1 << 20, source="a")
     box.put(samples(source="b"))
     box.put(event())
+    box.put(replace(samples(source="a"), accepted=False))
     box.put(samples(source="a"))
     assert [i.source for i in box.take()] == ["a"] and box.state.put["samples"] == 1
+    box = Mailbox({Event}, 10, 1 << 20, source="a")  # an event says nothing of arrays
+    box.put(event())
+    assert len(box.take()) == 1
+
+
+def test_a_mailbox_counts_the_bytes_of_samples_and_frames():
+    box, chunk = Mailbox({SourceChunk, Packet}, 10, 1 << 20), samples(4)
+    box.put(chunk)
+    arrays = sum(a.nbytes for a in (chunk.chunk.values, chunk.chunk.valid))
+    assert box.state.waiting_bytes == arrays + 4 * 16 + 500  # numbers and times of 8 bytes each
+    box.put(Packet("a", [CanFrame(1, b"")] * 3, 0))
+    assert box.state.waiting_bytes == arrays + 4 * 16 + 500 + 500 + 3 * 200
 
 
 def test_what_is_urgent_does_not_wait_for_what_is_gathered():
@@ -121,9 +136,12 @@ def test_who_joins_late_hears_of_open_streams_once_and_of_closed_ones_not_at_all
     for name in ("a", "b"):
         hub.post(Opened(name, SPEC, "u", ArraySource(SPEC, []), 1, 2))
     hub.post(Closed("a", 3))
-    box = Mailbox({Opened, Closed}, 10, 1 << 20)
+    box, other = Mailbox({Opened, Closed}, 10, 1 << 20), Mailbox({SourceChunk}, 10, 1 << 20)
     hub.join("x", box)
+    hub.join("y", other)
     hub.post(Closed("b", 4))
+    hub.post(samples())
+    assert len(other.take()) == 1
     assert [(type(i).__name__, i.source) for i in box.take()] == [("Opened", "b"), ("Closed", "b")]
     assert not hub.streams()
     hub.leave("x", Mailbox({Opened}, 10, 10))  # another one of that name: not this one

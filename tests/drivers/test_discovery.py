@@ -6,14 +6,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from tactile_rt.drivers.discovery import (
-    CanBus,
-    Port,
-    diagnose,
-    list_can_buses,
-    serial_ports,
-    udev_rules,
-)
+from tactile_rt.drivers import discovery
+from tactile_rt.drivers.discovery import CanBus, diagnose, list_can_buses
 
 
 @pytest.fixture
@@ -48,7 +42,7 @@ def test_ports_are_known_by_their_numbers(monkeypatch, tmp_path):
         port("/dev/ttyS4", None, None, hwid="n/a"),
     ]
     monkeypatch.setattr("serial.tools.list_ports.comports", lambda: found)
-    ports = serial_ports(tmp_path)
+    ports = discovery.serial_ports(tmp_path)
     assert [p.path for p in ports] == [f"/dev/tty{x}" for x in ("ACM0", "ACM1", "ACM2", "USB0")]
     adapter, skin, _, ftdi = ports
     assert adapter.url == "can:slcan:/dev/ttyACM0?codec="
@@ -57,7 +51,7 @@ def test_ports_are_known_by_their_numbers(monkeypatch, tmp_path):
 
 
 def port_at(path, usb=(0x0403, 0x6014), serial_number="FT3X"):
-    return Port(str(path), "", usb, serial_number, "", "")
+    return discovery.Port(str(path), "", usb, serial_number, "", "")
 
 
 @pytest.fixture
@@ -67,13 +61,9 @@ def port(tmp_path):
     return port_at(tmp_path / "ttyUSB0")
 
 
-def quiet(command):
-    return ""
-
-
 def test_a_port_that_may_not_be_opened_is_explained(port, tmp_path, monkeypatch):
     monkeypatch.setattr(os, "access", lambda *_: False)
-    (finding,) = diagnose([port], [], tmp_path, quiet)
+    (finding,) = diagnose([port], [], tmp_path, lambda _: "")
     assert not finding.good and "no permission" in finding.says
     assert finding.do.startswith("sudo usermod -aG ")
 
@@ -83,7 +73,7 @@ def test_a_slow_adapter_is_named(port, tmp_path, ms, good):
     timer = tmp_path / "bus/usb-serial/devices/ttyUSB0/latency_timer"
     timer.parent.mkdir(parents=True)
     timer.write_text(f"{ms}\n")
-    finding = diagnose([port], [], tmp_path, quiet)[-1]
+    finding = diagnose([port], [], tmp_path, lambda _: "")[-1]
     assert finding.good is good and f"{ms} ms" in finding.says
     assert good or str(timer) in finding.do
 
@@ -97,17 +87,16 @@ def test_a_slow_adapter_is_named(port, tmp_path, ms, good):
     ],
 )
 def test_a_bus_says_how_it_is(tmp_path, state, tx, good, do):
-    counted = {"bittiming": {"bitrate": 1_000_000}, "berr_counter": {"tx": tx, "rx": 0}}
-    info = {"state": state, **counted}
+    info = {"state": state, "bittiming": {"bitrate": 10**6}, "berr_counter": {"tx": tx, "rx": 0}}
     said = json.dumps([{"linkinfo": {"info_data": info}}])
     (finding,) = diagnose([], [CanBus("can0", True, 0, "")], tmp_path, lambda _: said)
     assert finding.good is good and state in finding.says and do in finding.do
 
 
 def test_a_bus_that_is_down_and_no_device_at_all(tmp_path):
-    (down,) = diagnose([], [CanBus("can0", False, 250_000, "")], tmp_path, quiet)
+    (down,) = diagnose([], [CanBus("can0", False, 250_000, "")], tmp_path, lambda _: "")
     assert not down.good and "up type can bitrate 250000" in down.do
-    (nothing,) = diagnose([], [], tmp_path, quiet)
+    (nothing,) = diagnose([], [], tmp_path, lambda _: "")
     assert not nothing.good and "emulate" in nothing.do
 
 
@@ -119,7 +108,7 @@ def test_a_modem_manager_is_noticed(port, tmp_path):
 
 
 def test_rules_name_each_device():
-    rules = udev_rules([port_at("/dev/ttyUSB0"), port_at("/dev/ttyS0", None)])
+    rules = discovery.udev_rules([port_at("/dev/ttyUSB0"), port_at("/dev/ttyS0", None)])
     assert 'ATTR{latency_timer}="1"' in rules
     (line,) = [x for x in rules.splitlines() if "SYMLINK" in x]
     assert 'ATTRS{idVendor}=="0403"' in line and 'SYMLINK+="tactile-FT3X"' in line
