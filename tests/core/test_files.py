@@ -6,6 +6,7 @@ import stat
 import subprocess
 from contextlib import nullcontext
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 
@@ -150,10 +151,7 @@ def test_a_folder_is_synced_by_a_handle_that_is_closed_again(tmp_path, monkeypat
 
 @pytest.mark.parametrize("code, fails", [(errno.EINVAL, False), (errno.EIO, True)])
 def test_only_a_file_system_that_cannot_sync_folders_is_excused(tmp_path, monkeypatch, code, fails):
-    def fail(handle):
-        raise OSError(code, os.strerror(code))
-
-    monkeypatch.setattr(os, "fsync", fail)
+    monkeypatch.setattr(os, "fsync", Mock(side_effect=OSError(code, "of the disk")))
     with pytest.raises(OSError) if fails else nullcontext():
         sync_folder(tmp_path)
 

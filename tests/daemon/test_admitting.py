@@ -1,5 +1,7 @@
 """One admission alone: what is asked of the trial and given to the classifier."""
 
+import threading
+
 import numpy as np
 import pytest
 
@@ -66,6 +68,15 @@ def test_the_trial_steps_as_the_classifier_will(model, monkeypatch, config, ever
     made = admitted(model, **config)
     assert trials.asked == [(model, TrialLimits(300.0, 7.0), every)]
     assert made.error is None and made.classifier is None and made.trial is trials.found
+
+
+def test_a_model_that_is_given_up_while_it_is_tried_is_not_loaded(model, monkeypatch):
+    over = threading.Event()
+    Trials(monkeypatch, during=lambda: over.wait(PATIENCE_S))
+    made = Admission(ModelConfig(file=str(model)), LIMITS, opened(), lambda t_ns: 0.0)
+    made.give_up()
+    over.set()
+    assert made.finished.wait(PATIENCE_S) and made.error is None and made.classifier is None
 
 
 def test_what_was_tried_is_not_tried_again(model, monkeypatch):

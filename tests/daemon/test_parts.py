@@ -103,9 +103,8 @@ def test_a_mailbox_counts_the_bytes_of_samples_and_frames():
     box, chunk = Mailbox({SourceChunk, Packet}, 10, 1 << 20), samples(4)
     box.put(chunk)
     arrays = sum(a.nbytes for a in (chunk.chunk.values, chunk.chunk.valid))
-    assert box.state.waiting_bytes == arrays + 4 * 16 + 500  # numbers and times of 8 bytes each
     box.put(Packet("a", [CanFrame(1, b"")] * 3, 0))
-    assert box.state.waiting_bytes == arrays + 4 * 16 + 500 + 500 + 3 * 200
+    assert box.state.waiting_bytes == (arrays + 4 * 16 + 500) + (500 + 3 * 200)
 
 
 def test_what_is_urgent_does_not_wait_for_what_is_gathered():
