@@ -29,14 +29,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from bench.perception.folds import FOLDS
-from bench.sim.list_objects import (
-    ALIKE,
-    BINS,
-    EVERYDAY_REPOSITORIES,
-    PAIRS,
-    REPOSITORIES,
-    YCB,
-)
+from bench.sim.list_objects import ALIKE, BINS, PAIRS, REPOSITORIES, YCB
 from tactile_rt.sim_backend.objects.mesh_files import read_parts
 
 Floats = NDArray[np.float64]
@@ -110,9 +103,9 @@ SOURCES = (
         )
         for world in ("small-house", "bookstore", "hospital")
     ),
-    *(
-        MeshSource(r.name, r.pattern, r.licence, "m3", r.up, r.scale, "base")
-        for r in EVERYDAY_REPOSITORIES
+    MeshSource(
+        "M3-org/base-meshes", r"models/(?P<name>[^/]+)/[^/]+\.glb", "CC0-1.0", "m3", "y", "1",
+        "base",
     ),
     *(
         MeshSource(
